@@ -22,7 +22,7 @@ Kind = Literal["restore", "steady", "several", "live"]
 
 
 class Stopped(BaseException):
-    """Raised in the thread of a job that was stopped; as KeyboardInterrupt, it passes what catches errors."""
+    """Raised in the thread of a job that was stopped; like KeyboardInterrupt, it is not caught where errors are."""
 
 
 @dataclass

@@ -5,7 +5,7 @@ Kolmogorov turbulence, and writes ``turbrestore/blur/witnesses/short_exposure.cs
 
 ``python benchmarks/blur_calibration.py FOLDER [--write benchmarks/results/blur_calibration.md]`` synthesizes clips into
 a folder, those that are there are kept: scenes through phase screens of random D/r0, diffraction, noise, codec, lens
-and number of frames; photographs that smooth flows move behind lenses of 0 to 2.5 px; and clips that stand still.  It
+and number of frames; photographs that smooth flows move behind lenses of 0 to 2.5 px; and clips that do not move.  It
 compares the widths that every witness finds, and the width that is removed, with the true transfer function of the
 filtered image, and the images before and after.  Constants were set on the scenes CHOSEN; the table is of the others.
 """

@@ -107,7 +107,7 @@ def plan(orders: Sequence[Order], out: Path, resume: bool, overwrite: bool) -> t
 
 
 def key_of(order: Order) -> str:
-    """Stand for the input and all settings that a result depends on."""
+    """Identify the input and all settings that a result depends on."""
     settings = (order.params, order.selection, order.bit_depth, order.memory_limit, order.tile, order.machine.device)
     stamps = [_stamp(file) for path in order.inputs for file in (frame_files(path) if path.is_dir() else [path])]
     text = f"{__version__}\0{settings!r}\0{stamps!r}\0{order.report is not None}"
@@ -115,7 +115,7 @@ def key_of(order: Order) -> str:
 
 
 def read_journal(path: Path) -> dict[str, ClipRow]:
-    """Read the newest row of every result, by its name; lines that are no rows, such as a cut one, are passed over."""
+    """Read the newest row of every result, by its name; lines that are no rows, such as a cut one, are skipped."""
     found: dict[str, ClipRow] = {}
     if not path.is_file():
         return found

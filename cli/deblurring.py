@@ -74,7 +74,7 @@ def deconvolve(
         of some width.
     sweep : str
         Widths to compare, such as ``1,1.4,2``.  The contact sheet shows the part of the image with the most detail
-        after each, without guards; what they object to stands in the title.
+        after each, without guards; what they object to is in the title.
     guide : Path
         Image or stage file that the nonlocal weights are taken from; the input by default, the centroid in the paper,
         which is moved onto the geometry of a filtered image.

@@ -145,7 +145,7 @@ def _check_outputs(inputs: list[Path], output: Path, table: Path, flows: Path | 
 
 
 class _Writer:
-    """Takes what is told of each frame while the frames pass to the file."""
+    """Takes what is told of each frame while the frames are written."""
 
     def __init__(self, source: FrameSource, restoration: Restoration, with_flows: bool, runtime: Runtime) -> None:
         shape = (*source.shape[:3], 2) if with_flows else (0,)

@@ -72,7 +72,7 @@ def settings(arguments: ArgumentCollection) -> dict[str, Argument]:
 
 
 def check_keys(path: Path, record: dict[str, Any], arguments: ArgumentCollection) -> None:
-    """Refuse keys that mean nothing, and values where a section belongs; both would be passed over in silence."""
+    """Refuse keys that mean nothing, and values where a section belongs; both would be ignored silently."""
     known = set(settings(arguments))
     sections = {key.rsplit(".", depth)[0] for key in known for depth in range(1, key.count(".") + 1)}
     for key, value in _flat(record):

@@ -1,10 +1,10 @@
 """A whole restoration on a device is that of the CPU; torch on the CPU stands in for a GPU."""
 
 import sys
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
+from torch_devices import NO_TORCH, on_devices
 
 from turbrestore.core.decision import Decision
 from turbrestore.core.errors import ConfigurationError
@@ -20,20 +20,7 @@ from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 from turbrestore_cli.__main__ import main
 
-NO_TORCH = pytest.mark.skipif(find_spec("torch") is None, reason="torch is not installed")
 TVL1 = FlowParams(method="tvl1")
-
-
-def devices():
-    """Names to test: torch on the CPU, and a GPU where there is one."""
-    if find_spec("torch") is None:
-        return [pytest.param("cpu:0", marks=NO_TORCH)]
-    import torch
-
-    return ["cpu:0", *(["cuda"] if torch.cuda.is_available() else [])]
-
-
-on_devices = pytest.mark.parametrize("device", devices())
 
 
 def psnr(image, truth):

@@ -55,7 +55,7 @@ def test_every_doubt_is_named(restoration):
         "as noisy as the average of 1.0 frames": {"filtered": replace(restoration.filtered, shares=np.eye(24)[0])},
         "100% of the pixels are saturated or seen in no frame": {"uncertainty": restoration.uncertainty + np.inf},
         "3% are at full scale": {"decisions": (Decision("saturation", "", "3% are at full scale"),)},
-        "may have left traces": {"decisions": (Decision("passers", "", ""),)},
+        "may have left traces": {"decisions": (Decision("moving objects", "", ""),)},
         "the frames contradict the filtered image": {"decisions": (Decision("structure", "", ""),)},
     }  # fmt: skip
     for words, change in doubts.items():

@@ -1,7 +1,7 @@
 """turbrestore: one sharp image from a video seen through atmospheric turbulence.
 
-The public names stand in ``__init__.pyi``; each is loaded when it is first used, so that importing the package costs
-nothing.
+The public names are listed in ``__init__.pyi``; each is loaded when it is first used, so that
+importing the package costs nothing.
 
 Examples
 --------

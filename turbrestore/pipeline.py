@@ -59,9 +59,9 @@ from .wording import (
 
 # Every border pixel of a cropped image is visible in at least this share of the training frames.
 _SEEN = 0.9
-# Least noise of dark parts relative to bright ones that is told in words.
+# Least variance of the noise of dark parts, relative to that of bright ones, that the decision states.
 _LEAST_SHARE = 0.01
-# Least standard deviation of ln V by a measured D/r0: theory and simulated clips agree no better.
+# Least standard deviation of ln V, the displacement that D/r0 implies: theory and simulated clips agree no better.
 _LEAST_SPREAD = 0.2
 
 
@@ -76,8 +76,8 @@ def restore(
 ) -> Restoration:
     """Restore one image from frames of a static scene.
 
-    Frames are read in order: a sample of them to survey the clip, all of them once more where something passes through
-    the scene, then the training frames, and those after them by the filter.  Only the training frames are kept, in
+    Frames are read in order: a sample of them to survey the clip, all of them once more if there are moving
+    objects, then the training frames, and those after them by the filter.  Only the training frames are kept, in
     memory or, if they do not fit, in a scratch file.
 
     Parameters
@@ -162,9 +162,9 @@ class _Evidence:
     """What :func:`_deblur_and_crop` needs to know from the training frames, which are freed before it runs."""
 
     saturation: float  # intensity from which the mean is saturated
-    is_mean: bool = False  # whether the mean is the image, because the filtered one has structure that they lack
-    witnesses: BlurWitnesses | None = None  # none if no blur is to be estimated
-    halves: Halves | None = None  # none for few frames too
+    is_mean: bool = False  # whether the mean replaces the filtered image, which has structure that the frames lack
+    witnesses: BlurWitnesses | None = None  # None if no blur is to be estimated
+    halves: Halves | None = None  # None then, and with few frames
 
 
 def _fuse(run: Run) -> tuple[Restoration, _Evidence]:
@@ -219,7 +219,7 @@ def _check_by_frames(
     """Check that the frames have the structure of the filtered image, else take the mean; measure how blurred it is."""
     image, flows = luminance(fused.image), fused.centroid.flows
     if mean_flow.any():
-        # Into the geometry of the centroid.
+        # The flows start from the geometry of the centroid.
         image = warp(image, invert_flow(recentring_flow(mean_flow)))
     structure = compare_structure(image, training, flows)
     run.decide(*explain_structure(structure))
@@ -305,24 +305,24 @@ def _find_witnesses(run: Run, training: FloatArray, fused: Restoration) -> BlurW
         if seeing is not None and measured is not None:
             displacement, frames = measured.value, seeing.independent_frames
         else:
-            # Without a displacement that can be measured, that of the flow stands for it, less what the camera adds.
-            about = [np.square(flow - np.median(flow, axis=(0, 1))).mean() for flow in iter_frames(flows)]
-            displacement, frames = float(np.mean(about)), float(len(training))
+            # Where no displacement can be measured, that of the flow is taken instead, less what the camera adds.
+            variances = [np.square(flow - np.median(flow, axis=(0, 1))).mean() for flow in iter_frames(flows)]
+            displacement, frames = float(np.mean(variances)), float(len(training))
         return measure_witnesses(cropped, flows, _of_optics(BlurWitnesses(displacement, frames, picture), run, seeing))
 
 
 def _of_optics(known: BlurWitnesses, run: Run, seeing: Seeing | None) -> BlurWitnesses:
-    """Add what is known of the optics, and of D/r0 by them."""
+    """Add the diffraction of the optics and, if D/r0 is measured, the displacement that it implies."""
     optics = run.params.optics
     if optics is None:
         return known
     strength, diffraction = None if seeing is None else seeing.d_over_r0, optics.diffraction
     if optics.distance is None or strength is None or not np.isfinite(strength.high):
         return replace(known, diffraction=diffraction)
-    made = float(displacement_variance(np.array(strength.value), np.array(diffraction)))
+    implied = float(displacement_variance(np.array(strength.value), np.array(diffraction)))
     # V grows as the power 5/3 of D/r0, and a 95 % interval has four standard deviations.
     spread = max(5 / 3 * np.log(strength.high / strength.low) / 4, _LEAST_SPREAD)
-    return replace(known, displacement=made, diffraction=diffraction, spread=float(spread))
+    return replace(known, displacement=implied, diffraction=diffraction, spread=float(spread))
 
 
 def _remove_blur(

@@ -1,4 +1,4 @@
-"""Preparation of the frames: without bars, overlays and what passes, under steady light, in units of their range."""
+"""Preparation of the frames: without bars, overlays and moving objects, under steady light, and stretched."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from .agreement.sensor_pattern import without_stripes
 from .core.decision import Decision
+from .footage.background import without_moving_objects
 from .footage.bars import Bars, without_bars
 from .footage.levels import Levels, stretch_levels
 from .footage.lighting.light import steady_light
 from .footage.lighting.white_balance import steady_white_balance
 from .footage.overlays import Title, read_static_mask, without_overlay
-from .footage.passers import without_passers
 from .footage.survey import measure_moments, take_survey
 from .io.source import FrameSource, Window
 from .results import Restoration, at_levels_of_clip
@@ -41,13 +41,13 @@ class Prepared:
 
 
 def prepare(source: FrameSource, static_mask: str = "auto", scratch: Path | None = None) -> Prepared:
-    """Prepare the frames of a clip, which are read once, and once more where something passes through the scene."""
+    """Prepare the frames of a clip, which are read once, and once more if there are moving objects."""
     mask = None if static_mask in ("auto", "off") else read_static_mask(static_mask, source)
     survey = take_survey(source, scratch)
     # Bars first: a dark field stop would be mistaken for bands of flicker.
     survey, bars, bar_decisions = without_bars(survey)
     moments = measure_moments(survey)
-    # Stripes before overlays: a dead column is static and would pass for an overlay.
+    # Stripes before overlays: a dead column is static and would be taken for an overlay.
     survey, stripe_decisions = without_stripes(survey, moments)
     hidden, title, overlay_decisions = None, None, tuple[Decision, ...]()
     if static_mask != "off":
@@ -58,7 +58,7 @@ def prepare(source: FrameSource, static_mask: str = "auto", scratch: Path | None
     survey, colour_decisions = steady_white_balance(survey)
     survey, light_decisions = steady_light(survey)
     survey, levels, range_decisions = stretch_levels(survey)
-    clip, passer_decisions = without_passers(survey) if static_mask != "off" else (survey.clip, ())
+    clip, object_decisions = without_moving_objects(survey) if static_mask != "off" else (survey.clip, ())
     decisions = (
         *bar_decisions,
         *stripe_decisions,
@@ -66,7 +66,7 @@ def prepare(source: FrameSource, static_mask: str = "auto", scratch: Path | None
         *colour_decisions,
         *light_decisions,
         *range_decisions,
-        *passer_decisions,
+        *object_decisions,
     )
     return Prepared(clip, levels, bars, hidden, title, decisions)
 

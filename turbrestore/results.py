@@ -99,7 +99,7 @@ class Restoration:
         x, y, width and height of the image within the frames, pixels.
     mean : ndarray, float32, shape (H, W) or (H, W, 3)
         Temporal mean of the prepared frames, in their size: all of them once the filter has run, else the training
-        frames.  What passes through the scene is not in it.
+        frames.  Moving objects are not in it.
     centroid : Centroid
     dynamics : FlowDynamics or None
         Where frames are processed in tiles it is for the record: the filter has a model of each tile.
@@ -246,8 +246,8 @@ def _checks(restoration: Restoration, motion: float, gain: float) -> Iterator[st
     if not restoration.centroid.converged:
         yield "the centroid has not converged"
     yield from (decision.reason for decision in restoration.decisions if decision.subject in _DOUBTS)
-    if any(decision.subject == "passers" for decision in restoration.decisions):
-        yield "objects that passed were replaced by the background and may have left traces"
+    if any(decision.subject == "moving objects" for decision in restoration.decisions):
+        yield "moving objects were replaced by the background and may have left traces"
     if restoration.seeing is not None and (doubt := restoration.seeing.disagreement):
         yield doubt
     if restoration.filtered is not None and not restoration.is_mean:

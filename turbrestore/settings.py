@@ -43,9 +43,9 @@ class RestoreParams:
     border : {"keep", "crop"}
         Keep the border, or crop it.  Fewer frames show the scene there; what nine frames in ten show is left.
     static_mask : str
-        What stands in the frame while the scene moves (a field stop, a reticle, a clock) is replaced by the scene
-        behind it: auto finds it, off leaves it, and else it is the path of an image that is not black there.  What
-        passes through the scene is replaced too, unless it is off.
+        A static overlay (a field stop, a reticle, a clock), which stays in place while the scene moves, is replaced by
+        the scene behind it: auto finds it, off leaves it, and else it is the path of an image that is not black there.
+        Moving objects are replaced too, unless it is off.
     pixel_scale : float, optional
         Angle of a pixel, rad.  With it and the aperture the blur by the air and by diffraction is better known, and the
         seeing is reported as D/r0 and r0.

@@ -100,7 +100,7 @@ class Page:
             button.props(f"aria-pressed={'true' if name == what else 'false'}")
 
     def _steps(self) -> tuple[OpenView, RunView, TuneView, SaveView, SteadyView, SeveralView]:
-        """Return what stands beside what is shown, from above."""
+        """Return the views of the steps, which are beside the picture, from the top down."""
         return (
             self.open_view, self.run_view, self.tune_view, self.save_view, self.steady_view, self.several_view,
         )  # fmt: skip

@@ -133,7 +133,7 @@ class StackingView:
                     ui.label(words)
         named = [str(self._range[0] + int(place)) for place in found.order]
         self._named.text = (
-            f"The last row is suggested: there detail stands highest above noise. The sharpest frames are "
+            f"The last row is suggested: there detail exceeds noise most. The sharpest frames are "
             f"{', '.join(named[:_NAMED])}, the softest {', '.join(named[: -_NAMED - 1 : -1])}."
         )
 

@@ -112,7 +112,7 @@ def _minus_laplacian(shape: tuple[int, ...]) -> FloatArray:
 
 def _squared_gradients(spectra: np.ndarray, xi: FloatArray) -> np.ndarray:
     """‖∇u‖² of every frame, up to one factor."""
-    # All columns of the half spectrum but the first, and of an even width the last, stand for two.
+    # All columns of the half spectrum but the first, and of an even width the last, count for two.
     return np.einsum("tij,ij->t", np.abs(spectra) ** 2, xi * np.where(np.arange(xi.shape[1]) > 0, 2, 1))
 
 

@@ -81,7 +81,7 @@ for name, image in stages.items():
 show(stages, rows=2)
 
 # %% [markdown]
-# The mean stands still, but the motion has blurred it more than any single frame. In the centroid, the mean of frames
+# The mean does not move, but the motion has blurred it more than any single frame. In the centroid, the mean of frames
 # that were first bent back, edges are straight and words can be read. The filter gives sharp frames more weight, and
 # deconvolution brings black and white back to the finest bars and the smallest letters. Some wobble stays in the
 # horizontal bars: along a bar no motion can be seen. Sharpness is the mean gradient relative to that of the truth.

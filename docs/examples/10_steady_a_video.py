@@ -85,7 +85,7 @@ show(
 
 # %% [markdown]
 # ## Steadiness
-# One row of the picture for all frames, time running downwards: what stands still is a vertical line. Right, how far
+# One row of the picture for all frames, time running downwards: what is static is a vertical line. Right, how far
 # each frame is from its truth.
 
 # %%

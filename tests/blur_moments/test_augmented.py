@@ -9,7 +9,7 @@ from turbrestore.blur_moments.sensor import ExposureTiming
 from turbrestore.blur_moments.state_estimation.augmented import Oscillator, OscillatorMotion
 from turbrestore.blur_moments.state_estimation.lifting import FastSystem, discretise, lift
 from turbrestore.core.errors import ConfigurationError
-from turbrestore.filtering.kalman import Gaussian
+from turbrestore.filtering.estimates import Gaussian
 
 TIMING = ExposureTiming(1e-3, 0.1, 0.35, 0.45, 0.09)
 

@@ -10,7 +10,7 @@ from turbrestore.blur_moments.moments import BlurModel
 from turbrestore.blur_moments.sensor import GaussianKernel, LineSensor, expose
 from turbrestore.blur_moments.state_estimation.image_observer import ImageFilter
 from turbrestore.blur_moments.state_estimation.observers import run_observer, steady_kalman
-from turbrestore.filtering.kalman import Gaussian
+from turbrestore.filtering.estimates import Gaussian
 
 WAVES = wavefront_setup()
 MODEL = WAVES.model

@@ -9,7 +9,7 @@ from turbrestore.blur_moments.moments import BlurModel, image_moments, predicted
 from turbrestore.blur_moments.sensor import ExposureTiming, GaussianKernel, LineSensor, PixelGrid, expose
 from turbrestore.blur_moments.state_estimation.lifting import FastSystem, discretise, is_observable, lift
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.filtering.kalman import Gaussian
+from turbrestore.filtering.estimates import Gaussian
 
 TIMING = ExposureTiming(1e-3, 0.1, 0.35, 0.45, 0.09)
 PAPER_2 = np.array([[0.0, -1156.0], [1.0, -13.6]]), np.array([1156.0, 0.0]), np.array([0.0, 1.0])

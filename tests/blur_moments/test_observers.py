@@ -20,7 +20,8 @@ from turbrestore.blur_moments.state_estimation.observers import (
     steady_kalman,
 )
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.filtering.kalman import Gaussian, update
+from turbrestore.filtering.estimates import Gaussian
+from turbrestore.filtering.kalman import update_covariance_form
 
 WAVES = wavefront_setup()
 MODEL = WAVES.model
@@ -106,7 +107,7 @@ class TestLaws:
         motion, pixels = MODEL.motion, MODEL.sensor.pixels
         measured = image_moments(frame, pixels, 1)[1:]
         R = moment_noise(pixels, 1, MODEL.sensor.noise)[1:, 1:]
-        linear, _ = update(state, measured - motion.D @ inputs, motion.C[None, :], R)
+        linear, _ = update_covariance_form(state, measured - motion.D @ inputs, motion.C[None, :], R)
         for method in ("extended", "unscented"):
             other, _ = MomentFilter((1,), method=method).step(MODEL, state, frame, inputs)
             np.testing.assert_allclose(other.mean, linear.mean, atol=1e-9)
@@ -143,7 +144,7 @@ class AsPrinted:
         forced, _, _ = predicted_moments(model, np.zeros_like(state.mean), inputs, (1, 2))
         measured = image_moments(frame, model.sensor.pixels, 2)[..., 1:]
         printed = np.einsum("...mn,...n->...m", H, state.mean) + forced
-        return update(state, measured, H, R, np.where([True, False], h, printed))
+        return update_covariance_form(state, measured, H, R, np.where([True, False], h, printed))
 
 
 class TestErrata:

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from conftest import make_sequence
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
-from turbrestore.filtering.kalman import Gaussian, PixelStacks, predict, update_information, update_pixels
+from turbrestore.filtering.estimates import Gaussian, PixelStacks
+from turbrestore.filtering.image_state import predict_image, update_image
+from turbrestore.filtering.kalman import predict, update_information_form
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams
 
@@ -120,7 +122,7 @@ def walk(seed, radius, noises, seen, steps, every):
     for step, noise in enumerate(10.0 ** rng.uniform(-9, 4, steps)):
         state = predict(state, A, Q)
         if measured[step]:
-            state, _ = update_information(state, values[step], C, noise)
+            state, _ = update_information_form(state, values[step], C, noise)
         assert (state.cov == state.cov.T).all()
         if step % every == every - 1:
             assert np.linalg.eigvalsh(state.cov).min() > 0, step
@@ -133,6 +135,6 @@ def test_pixel_variances_stay_positive_over_many_steps():
     state = PixelStacks(np.zeros((1, 2, 3), np.float32), np.ones((2, 3), np.float32))
     noises = (10.0 ** rng.uniform(-8, 8, (1000, 2, 3))).astype(np.float32)
     for step in range(20_000):
-        state, gain = update_pixels(state, state.mean, noises[step % 1000], drift=1e-9)
+        state, gain = update_image(predict_image(state, 1e-9), state.mean, noises[step % 1000])
     assert (state.variance > 0).all()
     assert ((gain >= 0) & (gain <= 1)).all()

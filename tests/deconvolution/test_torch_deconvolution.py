@@ -1,12 +1,11 @@
 """Deconvolution in torch finds what it finds in NumPy; torch on the CPU stands in for a GPU."""
 
-from importlib.util import find_spec
-
 import cv2
 import numpy as np
 import pair_operators as pairs
 import pytest
 from blurred_images import psnr
+from torch_devices import on_devices
 
 from turbrestore.core.errors import ConfigurationError
 from turbrestore.deconvolution.conjugate_gradient import ConjugateGradients
@@ -19,18 +18,6 @@ from turbrestore.runtime.runtime import Runtime
 from turbrestore.synthesis.scenes import SCENES, resolution_chart
 
 SIZE = 72
-
-
-def devices():
-    """Names to test: torch on the CPU, and a GPU where there is one."""
-    if find_spec("torch") is None:
-        return [pytest.param("cpu:0", marks=pytest.mark.skip(reason="torch is not installed"))]
-    import torch
-
-    return ["cpu:0", *(["cuda"] if torch.cuda.is_available() else [])]
-
-
-on_devices = pytest.mark.parametrize("device", devices())
 
 GUIDES = {
     "chart": (resolution_chart(64, 70), NonlocalParams()),

@@ -1,9 +1,8 @@
 """The filter with torch finds what it finds on the CPU; torch on the CPU stands in for a GPU."""
 
-from importlib.util import find_spec
-
 import numpy as np
 import pytest
+from torch_devices import DEVICES, on_devices
 
 from conftest import SCENES, make_sequence
 from turbrestore.core.arrays import luminance
@@ -17,18 +16,6 @@ from turbrestore.runtime.runtime import Runtime
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
 SIZE = 72
-
-
-def devices():
-    """Names to test: torch on the CPU, and a GPU where there is one."""
-    if find_spec("torch") is None:
-        return [pytest.param("cpu:0", marks=pytest.mark.skip(reason="torch is not installed"))]
-    import torch
-
-    return ["cpu:0", *(["cuda"] if torch.cuda.is_available() else [])]
-
-
-on_devices = pytest.mark.parametrize("device", devices())
 
 
 def frames_of(scene, count):
@@ -121,7 +108,7 @@ def test_lack_of_memory_is_one_line(device, monkeypatch):
         filter_both(frames, flows, flows, device)
 
 
-@pytest.mark.parametrize("device", ["cpu", *devices()])
+@pytest.mark.parametrize("device", ["cpu", *DEVICES])
 def test_a_warped_frame_has_its_luminance_and_pixels_come_back(device):
     image = coloured(SCENES["camera"](20))
     flow = np.full((20, 20, 2), 0.75, np.float32)

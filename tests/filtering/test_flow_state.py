@@ -8,7 +8,9 @@ from flow_systems import uneven_flows
 
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
 from turbrestore.dynamics.flow_model import flow_of, project_measured
-from turbrestore.filtering.kalman import Gaussian, advance_state, predict, update, update_state
+from turbrestore.filtering.estimates import Gaussian
+from turbrestore.filtering.flow_state import advance_flow_state, update_flow_state
+from turbrestore.filtering.kalman import predict, update_covariance_form
 
 
 @pytest.fixture
@@ -28,8 +30,8 @@ def test_the_projected_update_is_that_of_the_whole_flow(rng, dynamics):
     for flow in uneven_flows()[:4]:
         whole = predict(whole, dynamics.A, dynamics.Q)
         expected = (flow - flow_of(dynamics, whole.mean)).ravel()
-        state, innovation = advance_state(state, project_measured(flow, dynamics), dynamics)
-        whole, _ = update(whole, (flow - dynamics.mean_flow).ravel(), C, R)
+        state, innovation = advance_flow_state(state, project_measured(flow, dynamics), dynamics)
+        whole, _ = update_covariance_form(whole, (flow - dynamics.mean_flow).ravel(), C, R)
         np.testing.assert_allclose(state.mean, whole.mean, rtol=1e-5, atol=1e-5)
         np.testing.assert_allclose(state.cov, whole.cov, rtol=1e-5, atol=1e-6 * whole.cov.max())
         assert innovation == pytest.approx(np.sqrt(np.mean(expected.astype(np.float64) ** 2)), rel=1e-4)
@@ -39,14 +41,14 @@ def test_the_gain_is_that_of_the_information_form(rng, dynamics):
     predicted = Gaussian(rng.standard_normal(5), dynamics.state_covariance)
     measured = project_measured(uneven_flows()[0], dynamics)
     M = np.linalg.inv(np.eye(5) / dynamics.R + np.linalg.inv(predicted.cov)) / dynamics.R
-    state, _ = update_state(predicted, measured, dynamics)
+    state, _ = update_flow_state(predicted, measured, dynamics)
     np.testing.assert_allclose(state.mean, predicted.mean + M @ (measured.state - predicted.mean), rtol=1e-9)
     np.testing.assert_allclose(state.cov, (np.eye(5) - M) @ predicted.cov, rtol=1e-8, atol=1e-9 * predicted.cov.max())
 
 
 def test_a_model_that_explains_everything_keeps_a_gain(rng, dynamics):
     exact = replace(dynamics, R=0.0)
-    state, _ = update_state(
+    state, _ = update_flow_state(
         Gaussian(np.zeros(5), dynamics.state_covariance), project_measured(uneven_flows()[1], dynamics), exact
     )
     assert np.linalg.eigvalsh(state.cov).min() > 0
@@ -57,7 +59,7 @@ def test_a_covariance_without_rank_stays_one(dynamics):
     """P is singular where a state is known exactly, and spans twelve orders of magnitude at the start."""
     basis = np.linalg.qr(np.random.default_rng(5).standard_normal((5, 5)))[0]
     P = (basis * [1e6, 1e3, 1.0, 1e-6, 0.0]) @ basis.T
-    state, _ = update_state(
+    state, _ = update_flow_state(
         Gaussian(np.zeros(5), (P + P.T) / 2), project_measured(uneven_flows()[0], dynamics), replace(dynamics, R=1e-6)
     )
     values = np.linalg.eigvalsh(state.cov)
@@ -67,7 +69,7 @@ def test_a_covariance_without_rank_stays_one(dynamics):
 
 def test_a_model_without_states_learns_nothing(dynamics):
     still = identify(np.zeros((3, 2, 2, 2), np.float32))
-    state, innovation = update_state(
+    state, innovation = update_flow_state(
         Gaussian(np.zeros(0), np.zeros((0, 0))), project_measured(np.ones((2, 2, 2), np.float32), still), still
     )
     assert state.mean.size == 0 and innovation == pytest.approx(1.0)

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from turbrestore.core.errors import DataError
-from turbrestore.filtering.kalman import Gaussian, PixelGaussian, PixelStacks, predict, update, update_pixels
+from turbrestore.filtering.estimates import Gaussian, PixelGaussian, PixelStacks
+from turbrestore.filtering.image_state import predict_image, update_image
+from turbrestore.filtering.kalman import predict, update_covariance_form
 
 
 @pytest.fixture
@@ -18,13 +20,13 @@ def test_each_pixel_equals_the_general_kalman_filter(rng, channels, dtype):
     shape, drift = (3, 4), 0.25
     state = PixelStacks(rng.random((channels, *shape)).astype(dtype), rng.uniform(0.1, 2.0, shape).astype(dtype))
     noise, frame = rng.uniform(0.1, 2.0, shape).astype(dtype), rng.random((channels, *shape)).astype(dtype)
-    after, gain = update_pixels(state, frame, noise, drift)
+    after, gain = update_image(predict_image(state, drift), frame, noise)
     assert after.mean.dtype == after.variance.dtype == gain.dtype == dtype
     tolerance, unit = 1e-12 if dtype is np.float64 else 1e-5, np.eye(channels)
     for y, x in np.ndindex(shape):
         one = predict(Gaussian(state.mean[:, y, x], state.variance[y, x] * unit), unit, drift * unit)
         prior = one.cov[0, 0]
-        one, _ = update(one, frame[:, y, x], unit, noise[y, x] * unit)
+        one, _ = update_covariance_form(one, frame[:, y, x], unit, noise[y, x] * unit)
         np.testing.assert_allclose(after.mean[:, y, x], one.mean, rtol=tolerance)
         np.testing.assert_allclose(after.variance[y, x], one.cov[0, 0], rtol=tolerance)
         np.testing.assert_allclose(gain[y, x], prior / (prior + noise[y, x]), rtol=tolerance)
@@ -32,14 +34,14 @@ def test_each_pixel_equals_the_general_kalman_filter(rng, channels, dtype):
 
 def test_the_variance_survives_nearly_exact_measurements():
     prior = PixelStacks(np.zeros((1, 1, 1), np.float32), np.ones((1, 1), np.float32))
-    after, _ = update_pixels(prior, prior.mean + 1, np.full((1, 1), 1e-9, np.float32), 0.0)
+    after, _ = update_image(prior, prior.mean + 1, np.full((1, 1), 1e-9, np.float32))
     assert after.variance[0, 0] == pytest.approx(1e-9, rel=1e-5)
 
 
 def test_inputs_are_left_alone(rng):
     arrays = [rng.random((3, 2, 5)), rng.random((2, 5)), rng.random((3, 2, 5)), rng.random((2, 5))]
     before = [array.copy() for array in arrays]
-    update_pixels(PixelStacks(*arrays[:2]), *arrays[2:], drift=0.1)
+    update_image(predict_image(PixelStacks(*arrays[:2]), drift=0.1), *arrays[2:])
     for array, copy in zip(arrays, before, strict=True):
         np.testing.assert_array_equal(array, copy)
 

@@ -7,12 +7,8 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from turbrestore.core.errors import DataError
-from turbrestore.filtering.kalman import (
-    Gaussian,
-    predict,
-    update,
-    update_information,
-)
+from turbrestore.filtering.estimates import Gaussian
+from turbrestore.filtering.kalman import predict, update_covariance_form, update_information_form
 
 
 def covariance(rng: np.random.Generator, n: int, *batch: int) -> np.ndarray:
@@ -72,7 +68,11 @@ def test_filter_equals_batch_least_squares(rng, form, gaps):
     state = prior
     for k, z in enumerate(measurements):
         state = state if k == 0 else predict(state, A, Q)
-        state, _ = update(state, z, H, R) if form == "covariance" else update_information(state, z, H, variance)
+        state, _ = (
+            update_covariance_form(state, z, H, R)
+            if form == "covariance"
+            else update_information_form(state, z, H, variance)
+        )
     mean, cov = batch_estimate(prior, A, Q, H, R, measurements)
     assert_same(state, Gaussian(mean, 0.5 * (cov + cov.T)))
 
@@ -85,8 +85,8 @@ def test_information_equals_covariance_form_and_its_record(rng, scalar):
     z[[3, 17]] = np.nan
     variance = 0.7 if scalar else rng.uniform(0.2, 2.0, m)
     R = np.diag(np.broadcast_to(variance, m))
-    a, record_a = update(prior, z, H, R)
-    b, record_b = update_information(prior, z, H, variance)
+    a, record_a = update_covariance_form(prior, z, H, R)
+    b, record_b = update_information_form(prior, z, H, variance)
     assert_same(a, b)
     np.testing.assert_allclose(record_a.normalised_squared, record_b.normalised_squared, rtol=1e-10)
     np.testing.assert_allclose(record_a.log_likelihood, record_b.log_likelihood, rtol=1e-10)
@@ -103,11 +103,11 @@ def test_information_form_takes_a_singular_prior(rng):
     direction = rng.standard_normal((n, 1))
     prior = Gaussian(np.zeros(n), direction @ direction.T)
     H, z = rng.standard_normal((m, n)), rng.standard_normal(m)
-    assert_same(update(prior, z, H, 0.5 * np.eye(m))[0], update_information(prior, z, H, 0.5)[0])
+    assert_same(update_covariance_form(prior, z, H, 0.5 * np.eye(m))[0], update_information_form(prior, z, H, 0.5)[0])
 
 
 def test_information_form_with_no_state_at_all():
-    state, record = update_information(Gaussian(np.zeros(0), np.zeros((0, 0))), np.ones(4), np.zeros((4, 0)), 0.5)
+    state, record = update_information_form(Gaussian(np.zeros(0), np.zeros((0, 0))), np.ones(4), np.zeros((4, 0)), 0.5)
     assert state.mean.shape == (0,)
     assert record.normalised_squared == pytest.approx(8.0)
     assert predict(state, np.zeros((0, 0)), np.zeros((0, 0))).cov.shape == (0, 0)
@@ -124,7 +124,7 @@ def test_two_predictions_are_one_of_the_squared_system(rng):
 def test_an_update_never_adds_uncertainty(seed, n, m):
     rng = np.random.default_rng(seed)
     prior = Gaussian(rng.standard_normal(n), covariance(rng, n))
-    after, _ = update(prior, rng.standard_normal(m), rng.standard_normal((m, n)), covariance(rng, m))
+    after, _ = update_covariance_form(prior, rng.standard_normal(m), rng.standard_normal((m, n)), covariance(rng, m))
     assert np.linalg.eigvalsh(prior.cov - after.cov).min() > -1e-10 * np.abs(prior.cov).max()
     assert np.trace(after.cov) < np.trace(prior.cov)
 
@@ -140,7 +140,11 @@ def test_batched_equals_loop(rng, form):
 
     def step(mean, cov, A, H, z):
         state = predict(Gaussian(mean, cov), A, Q)
-        return update(state, z, H, R) if form == "covariance" else update_information(state, z, H, 0.5)
+        return (
+            update_covariance_form(state, z, H, R)
+            if form == "covariance"
+            else update_information_form(state, z, H, 0.5)
+        )
 
     together, record = step(means, covs, A, H, z)
     for i in range(batch):
@@ -159,19 +163,22 @@ def test_one_covariance_serves_a_batch_of_means(rng):
         np.ones((1, n)),
         rng.standard_normal((5, 1)),
     )
-    together, _ = update(Gaussian(means, P), z, H, np.eye(1))
+    together, _ = update_covariance_form(Gaussian(means, P), z, H, np.eye(1))
     assert together.cov.shape == (n, n)
-    information = update_information(Gaussian(means, P), z, H / np.sqrt(n), 1.0)[0]
+    information = update_information_form(Gaussian(means, P), z, H / np.sqrt(n), 1.0)[0]
     for i in range(batch):
-        assert_same(update(Gaussian(means[i], P), z[i], H, np.eye(1))[0], Gaussian(together.mean[i], together.cov))
-        alone = update_information(Gaussian(means[i], P), z[i], H / np.sqrt(n), 1.0)[0]
+        assert_same(
+            update_covariance_form(Gaussian(means[i], P), z[i], H, np.eye(1))[0],
+            Gaussian(together.mean[i], together.cov),
+        )
+        alone = update_information_form(Gaussian(means[i], P), z[i], H / np.sqrt(n), 1.0)[0]
         np.testing.assert_allclose(information.mean[i], alone.mean, rtol=1e-12)
 
 
 def test_missing_measurement_is_no_update(rng):
     prior = Gaussian(rng.standard_normal(3), covariance(rng, 3))
     H, z = rng.standard_normal((2, 3)), np.full(2, np.nan)
-    for after, record in (update(prior, z, H, np.eye(2)), update_information(prior, z, H, 1.0)):
+    for after, record in (update_covariance_form(prior, z, H, np.eye(2)), update_information_form(prior, z, H, 1.0)):
         np.testing.assert_array_equal(after.mean, prior.mean)
         np.testing.assert_allclose(after.cov, prior.cov, rtol=1e-13)
         assert record.observed == 0
@@ -183,8 +190,8 @@ def test_missing_component_is_the_shorter_measurement(rng):
     H, R, z = rng.standard_normal((3, 3)), covariance(rng, 3), rng.standard_normal(3)
     z[1] = np.nan
     seen = [0, 2]
-    after, record = update(prior, z, H, R)
-    shorter, record_shorter = update(prior, z[seen], H[seen], R[np.ix_(seen, seen)])
+    after, record = update_covariance_form(prior, z, H, R)
+    shorter, record_shorter = update_covariance_form(prior, z[seen], H[seen], R[np.ix_(seen, seen)])
     assert_same(after, shorter)
     np.testing.assert_allclose(record.log_likelihood, record_shorter.log_likelihood, rtol=1e-12)
     np.testing.assert_allclose(record.values[seen], record_shorter.values)
@@ -196,29 +203,29 @@ def test_splitting_a_measurement_changes_nothing(rng):
     prior = Gaussian(rng.standard_normal(3), covariance(rng, 3))
     H, z = rng.standard_normal((4, 3)), rng.standard_normal(4)
     variance = rng.uniform(0.5, 1.5, 4)
-    whole, _ = update(prior, z, H, np.diag(variance))
+    whole, _ = update_covariance_form(prior, z, H, np.diag(variance))
     state = prior
     for i in range(4):
-        state, _ = update(state, z[i : i + 1], H[i : i + 1], variance[i] * np.eye(1))
+        state, _ = update_covariance_form(state, z[i : i + 1], H[i : i + 1], variance[i] * np.eye(1))
     assert_same(whole, state)
 
 
 def test_iterating_from_the_same_prior_changes_nothing_on_a_linear_model(rng):
     prior = Gaussian(rng.standard_normal(3), covariance(rng, 3))
     H, z, R = rng.standard_normal((4, 3)), rng.standard_normal(4), covariance(rng, 4)
-    first, _ = update(prior, z, H, R)
+    first, _ = update_covariance_form(prior, z, H, R)
     at = first.mean
     for _ in range(3):
         # The iterated extended Kalman filter linearises at the last estimate and keeps the prior.
         predicted = H @ at + H @ (prior.mean - at)
-        again, _ = update(prior, z, H, R, predicted=predicted)
+        again, _ = update_covariance_form(prior, z, H, R, predicted=predicted)
         assert_same(again, first)
         at = again.mean
 
 
 def test_nonlinear_measurement_uses_its_own_prediction():
     prior = Gaussian(np.array([2.0]), np.eye(1))
-    after, record = update(prior, [4.5], [[4.0]], [[1.0]], predicted=[4.0])
+    after, record = update_covariance_form(prior, [4.5], [[4.0]], [[1.0]], predicted=[4.0])
     assert record.values == pytest.approx([0.5])
     assert after.mean == pytest.approx([2.0 + 4.0 / 17.0 * 0.5])
 
@@ -243,7 +250,7 @@ def test_log_likelihoods_add_up_to_the_joint_density(rng):
     total, state = 0.0, prior
     for k in range(steps):
         state = state if k == 0 else predict(state, A, Q)
-        state, record = update(state, z[k], H, R)
+        state, record = update_covariance_form(state, z[k], H, R)
         total += float(record.log_likelihood)
     assert total == pytest.approx(joint.logpdf(z.ravel()), rel=1e-10)
 
@@ -256,7 +263,7 @@ def test_innovations_of_a_true_model_are_chi_squared(rng):
     for _ in range(steps):
         truth = truth @ A.T + rng.multivariate_normal(np.zeros(n), Q, size=runs)
         z = truth @ H.T + rng.multivariate_normal(np.zeros(m), R, size=runs)
-        state, record = update(predict(state, A, Q), z, H, R)
+        state, record = update_covariance_form(predict(state, A, Q), z, H, R)
         squared.append(record.normalised_squared)
     # Innovations are white, so the 4000 values are independent: mean m, variance 2 m.
     assert np.mean(squared) == pytest.approx(m, abs=4 * np.sqrt(2 * m / (runs * steps)))
@@ -276,7 +283,10 @@ def test_covariance_stays_positive_over_many_steps(seed, n, log_noise, radius):
     for _ in range(80):
         z = np.where(rng.random(m) < 0.2, np.nan, rng.standard_normal(m))
         states = [predict(state, A, Q) for state in states]
-        states = [update(states[0], z, H, noise * np.eye(m))[0], update_information(states[1], z, H, noise)[0]]
+        states = [
+            update_covariance_form(states[0], z, H, noise * np.eye(m))[0],
+            update_information_form(states[1], z, H, noise)[0],
+        ]
         for state in states:
             np.testing.assert_array_equal(state.cov, state.cov.T)
             assert np.linalg.eigvalsh(state.cov).min() > 0
@@ -285,7 +295,9 @@ def test_covariance_stays_positive_over_many_steps(seed, n, log_noise, radius):
 def test_nearly_exact_measurements_leave_their_own_variance(rng):
     # P is 1e18 times R: the short form (I − M H) P would leave rounding errors, negative ones among them.
     for _ in range(20):
-        after, _ = update(Gaussian(np.zeros(3), 1e8 * covariance(rng, 3)), np.zeros(2), np.eye(2, 3), 1e-10 * np.eye(2))
+        after, _ = update_covariance_form(
+            Gaussian(np.zeros(3), 1e8 * covariance(rng, 3)), np.zeros(2), np.eye(2, 3), 1e-10 * np.eye(2)
+        )
         np.testing.assert_allclose(after.cov[:2, :2], 1e-10 * np.eye(2), rtol=1e-6, atol=1e-16)
 
 
@@ -300,14 +312,14 @@ def test_nearly_exact_measurements_leave_their_own_variance(rng):
         (lambda: Gaussian(np.float64(1.0), np.eye(1)), "mean: expected shape"),
         (lambda: predict(GOOD, np.eye(3), np.eye(2)), "A: expected shape"),
         (lambda: predict(GOOD, np.eye(2), -np.eye(2)), "Q: expected a positive"),
-        (lambda: update(GOOD, [1.0], np.zeros((1, 2)), np.zeros((1, 1))), "innovation covariance"),
-        (lambda: update(GOOD, [1.0], np.ones((1, 2)), -0.5 * np.eye(1)), "R: expected a positive"),
-        (lambda: update(GOOD, [np.inf], np.ones((1, 2)), np.eye(1)), "measurement: expected finite"),
-        (lambda: update(GOOD, [1.0, 2.0], np.ones((1, 2)), np.eye(2)), "H: expected shape"),
-        (lambda: update_information(GOOD, 1.0, np.ones((1, 2)), 1.0), "measurement: expected shape"),
-        (lambda: update_information(GOOD, [1.0], np.ones((1, 2)), 0.0), "noise_variance: expected finite"),
-        (lambda: update_information(GOOD, [1.0], np.ones((1, 2)), [1.0, 2.0]), "noise_variance: expected one"),
-        (lambda: update_information(GOOD, [1.0], np.full((1, 2), np.nan), 1.0), "expected finite"),
+        (lambda: update_covariance_form(GOOD, [1.0], np.zeros((1, 2)), np.zeros((1, 1))), "innovation covariance"),
+        (lambda: update_covariance_form(GOOD, [1.0], np.ones((1, 2)), -0.5 * np.eye(1)), "R: expected a positive"),
+        (lambda: update_covariance_form(GOOD, [np.inf], np.ones((1, 2)), np.eye(1)), "measurement: expected finite"),
+        (lambda: update_covariance_form(GOOD, [1.0, 2.0], np.ones((1, 2)), np.eye(2)), "H: expected shape"),
+        (lambda: update_information_form(GOOD, 1.0, np.ones((1, 2)), 1.0), "measurement: expected shape"),
+        (lambda: update_information_form(GOOD, [1.0], np.ones((1, 2)), 0.0), "noise_variance: expected finite"),
+        (lambda: update_information_form(GOOD, [1.0], np.ones((1, 2)), [1.0, 2.0]), "noise_variance: expected one"),
+        (lambda: update_information_form(GOOD, [1.0], np.full((1, 2), np.nan), 1.0), "expected finite"),
     ],
 )
 def test_unusable_input_is_a_clear_error(call, words):
@@ -331,8 +343,8 @@ def test_inputs_are_left_alone(rng):
     H, z, R = rng.standard_normal((3, 2)), np.array([1.0, np.nan, 2.0]), np.eye(3)
     arrays = [prior.mean, prior.cov, H, z, R]
     before = [array.copy() for array in arrays]
-    update(prior, z, H, R)
-    update_information(prior, z, H, 1.0)
+    update_covariance_form(prior, z, H, R)
+    update_information_form(prior, z, H, 1.0)
     predict(prior, np.eye(2), np.eye(2))
     for array, copy in zip(arrays, before, strict=True):
         np.testing.assert_array_equal(array, copy)

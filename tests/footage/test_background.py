@@ -1,4 +1,4 @@
-"""What passes through a scene is replaced by the background, and nothing else is."""
+"""Moving objects are replaced by the background, and nothing else is."""
 
 import functools
 
@@ -8,7 +8,7 @@ import pytest
 
 from conftest import photograph, surveyed
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
-from turbrestore.footage.passers import without_passers
+from turbrestore.footage.background import without_moving_objects
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
 from turbrestore.settings import RestoreParams
@@ -27,7 +27,7 @@ def clip(scene, objects=0, channels=1, d_over_r0=2.5):
     truth = SCENES[scene](SIDE, SIDE)
     if channels == 3:
         truth = truth[..., None] * np.float32([1.0, 0.8, 0.6])
-    passing = draw_objects(objects, truth.shape, np.random.default_rng(5))
+    moving = draw_objects(objects, truth.shape, np.random.default_rng(5))
     params = PhaseScreenParams(d_over_r0)
 
     def seen(some):
@@ -37,13 +37,13 @@ def clip(scene, objects=0, channels=1, d_over_r0=2.5):
         return frames
 
     empty = seen(())
-    return (seen(passing) if objects else empty), empty
+    return (seen(moving) if objects else empty), empty
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_frames_show_the_background_where_objects_pass(channels):
+def test_frames_show_the_background_behind_moving_objects(channels):
     frames, empty = clip("brick", 3, channels)
-    cleaned, (decision,) = without_passers(surveyed(frames))
+    cleaned, (decision,) = without_moving_objects(surveyed(frames))
     cleaned = cleaned.read()
     covered = np.abs(frames - empty).reshape(*empty.shape[:3], -1).max(axis=3) > 0.1
     assert covered.mean() > 0.03
@@ -51,7 +51,7 @@ def test_frames_show_the_background_where_objects_pass(channels):
     assert after < 0.4 * before
     far = cv2.dilate(covered.any(axis=0).astype(np.uint8), np.ones((21, 21))) == 0
     assert np.array_equal(cleaned[:, far], frames[:, far])
-    assert decision.subject == "passers"
+    assert decision.subject == "moving objects"
 
 
 def test_the_image_is_that_of_the_clip_without_objects():
@@ -63,23 +63,23 @@ def test_the_image_is_that_of_the_clip_without_objects():
 
 
 def test_a_window_of_a_frame_is_cleaned_as_the_whole_frame_is():
-    cleaned, _ = without_passers(surveyed(clip("brick", 3)[0]))
+    cleaned, _ = without_moving_objects(surveyed(clip("brick", 3)[0]))
     whole, part = cleaned.read(), cleaned.select(roi=(20, 10, 90, 100)).read()
     assert np.array_equal(whole[:, 10:110, 20:110], part)
 
 
 @pytest.mark.parametrize("scene", ["camera", "chart", "brick"])
-def test_turbulence_passes_for_nothing(scene):
+def test_turbulence_is_no_moving_object(scene):
     survey = surveyed(clip(scene, d_over_r0=5.0)[1])
-    assert without_passers(survey) == (survey.clip, ())
+    assert without_moving_objects(survey) == (survey.clip, ())
 
 
 @pytest.mark.parametrize("scene", ["coffee", "page"])
-def test_frames_that_are_bent_by_many_pixels_pass_for_nothing(scene):
+def test_frames_that_are_bent_by_many_pixels_hold_no_moving_objects(scene):
     rng = np.random.default_rng(1)
     moved = smooth_flows(25, 160, 160, rng, SmoothFlowParams(rms=4.0))
     survey = surveyed(distort(photograph(scene, 160), moved, rng, blur=1.2, noise=0.01))
-    assert without_passers(survey) == (survey.clip, ())
+    assert without_moving_objects(survey) == (survey.clip, ())
 
 
 def test_a_planet_that_drifts_is_the_scene():
@@ -87,27 +87,27 @@ def test_a_planet_that_drifts_is_the_scene():
     frames = np.float32([0.8 * (np.hypot(x - 30 - 4 * k, y - 48) < 20) for k in range(25)])
     frames += 0.05 * (np.random.default_rng(0).random((96, 160)) > 0.998)  # Stars, which the planet covers.
     survey = surveyed(cv2.GaussianBlur(frames.transpose(1, 2, 0), (0, 0), 1.5).transpose(2, 0, 1))
-    assert without_passers(survey) == (survey.clip, ())
+    assert without_moving_objects(survey) == (survey.clip, ())
 
 
-def test_nothing_passes_while_the_camera_moves():
+def test_the_scene_is_no_moving_object_while_the_camera_moves():
     scene = SCENES["camera"](160, 240)
     survey = surveyed(np.stack([scene[:, 4 * k : 4 * k + 140] for k in range(25)]))
-    assert without_passers(survey) == (survey.clip, ())
+    assert without_moving_objects(survey) == (survey.clip, ())
 
 
 def test_a_black_frame_is_left_as_it_is():
     frames, empty = (some.copy() for some in clip("brick", 3))
     frames[[5, 20]] = 0
-    cleaned, _ = without_passers(surveyed(frames))
+    cleaned, _ = without_moving_objects(surveyed(frames))
     assert not cleaned.read()[[5, 20]].any()
     empty[5] = 0
-    assert without_passers(surveyed(empty))[1] == ()
+    assert without_moving_objects(surveyed(empty))[1] == ()
 
 
 def test_few_frames_tell_nothing():
     survey = surveyed(clip("brick", 3)[0][:8])
-    assert without_passers(survey) == (survey.clip, ())
+    assert without_moving_objects(survey) == (survey.clip, ())
 
 
 def snowy(frames, share, seed=3):
@@ -124,7 +124,7 @@ def snowy(frames, share, seed=3):
 def test_snow_is_replaced_by_the_background():
     empty = 0.8 * clip("camera")[1]
     frames, covers = snowy(empty, 0.06)
-    cleaned, (decision,) = without_passers(surveyed(frames))
+    cleaned, (decision,) = without_moving_objects(surveyed(frames))
     before, after = (np.abs(some - empty)[covers > 0.3].mean() for some in (frames, cleaned.read()))
     assert after < 0.25 * before
     assert "snow" in decision.reason
@@ -144,8 +144,8 @@ def test_a_car_is_replaced_while_the_camera_moves():
     frames = empty.copy()
     for k, frame in enumerate(frames):
         frame[90:120, 6 * k - 50 : 6 * k] = 0.95 if 50 <= 6 * k <= 160 else frame[90:120, 6 * k - 50 : 6 * k]
-    cleaned, (decision,) = without_passers(surveyed(frames))
+    cleaned, (decision,) = without_moving_objects(surveyed(frames))
     covered = np.abs(frames - empty) > 0.1
-    assert covered.any() and decision.subject == "passers"
+    assert covered.any() and decision.subject == "moving objects"
     before, after = (np.sqrt(np.mean((some - empty)[covered] ** 2)) for some in (frames, cleaned.read()))
     assert after < 0.3 * before

@@ -62,14 +62,18 @@ def test_memory_hardly_grows_with_the_clip():
     )
 
 
-def test_a_clip_is_read_for_the_survey_and_for_the_filter_and_once_more_where_something_passes():
+def test_a_clip_is_read_for_the_survey_and_for_the_filter_and_once_more_for_moving_objects():
     frames = make_sequence(7, 30, 96, "camera", blur=0.8, noise=0.008, rms=1.2).frames.clip(0, 1)
     walked = 0.8 * frames
     for number, frame in enumerate(walked):
         frame[40:75, 4 * number : 4 * number + 14] = 0.05
     flickering = 0.6 * frames * (1 + 0.3 * np.sin(np.arange(30) / 4))[:, None, None]
     flickering[:, :12] = 0
-    for clip, subjects, times in ((frames, set(), 2), (flickering, {"bars", "light"}, 2), (walked, {"passers"}, 3)):
+    for clip, subjects, times in (
+        (frames, set(), 2),
+        (flickering, {"bars", "light"}, 2),
+        (walked, {"moving objects"}, 3),
+    ):
         source, read = counting(clip.astype(np.float32))
         assert {found.subject for found in prepare(source).decisions} >= subjects
         assert len(read) == 30 * (times - 1)

@@ -18,7 +18,7 @@ from turbrestore.core.errors import (
     StorageError,
 )
 from turbrestore.io.containers.integrity import ffv1_slices_intact, is_cut_short
-from turbrestore.io.images import write_image
+from turbrestore.io.images import read_image, write_image
 from turbrestore.io.limits import Limits
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video
@@ -243,6 +243,30 @@ class TestDamage:
         data = path.read_bytes()
         path.write_bytes(data[: int(share * len(data))])
         assert refused(path, DataError) == 65
+
+    @pytest.mark.parametrize("big", [False, True])
+    def test_tiff_strips_and_tiles_without_bytes(self, tmp_path, big):
+        path, stack = tmp_path / "a.tif", np.random.default_rng(0).integers(1, 256, (3, 32, 32), dtype=np.uint8)
+        for layout in ({"rowsperstrip": 32}, {"rowsperstrip": 8}, {"tile": (16, 16)}):
+            for compression in (None, "deflate"):
+                with tifffile.TiffWriter(path, bigtiff=big) as tiff:
+                    for frame in stack:
+                        tiff.write(frame, compression=compression, contiguous=False, metadata=None, **layout)
+                whole, tags = path.read_bytes(), (324, 325) if "tile" in layout else (273, 279)
+                np.testing.assert_array_equal(open_frames(path).read(), stack / np.float32(255))
+                # A count or an offset of zero, and offsets past the end of the file.
+                for tag, value in ((tags[1], 0), (tags[0], 0), (tags[0], len(whole)), (tags[0], 2**32 - 1)):
+                    path.write_bytes(whole)
+                    with tifffile.TiffFile(path, mode="r+") as tiff:
+                        entry = tiff.pages[2].tags[tag]
+                        entry.overwrite((*entry.value[:-1], value), dtype="Q" if big else "I")
+                    assert refused(path, DataError, f"{path}: frame 2: expected", "found none in 1 of") == 65
+                    np.testing.assert_array_equal(open_frames(path, frames=(0, 2)).read(), stack[:2] / np.float32(255))
+        tifffile.imwrite(path, stack[0], bigtiff=big, metadata=None)
+        with tifffile.TiffFile(path, mode="r+") as tiff:
+            tiff.pages[0].tags[279].overwrite((0,))
+        with pytest.raises(DataError, match="expected pixels in all strips and tiles, found none in 1 of 1"):
+            read_image(path)
 
     @pytest.mark.parametrize("name", ["a.mkv", "a.avi", "a.gif", "a.mp4"])
     def test_the_intact_part_of_a_truncated_video_can_be_read(self, tmp_path, name):

@@ -223,7 +223,8 @@ def test_flows_in_a_file_are_those_in_memory(sequence, tmp_path):
 def test_frames_are_prepared_once_where_memory_allows(monkeypatch, tmp_path, scratch):
     calls = []
     monkeypatch.setattr(
-        "turbrestore.registration.flow.grey_levels", lambda *a, find=flow.grey_levels: calls.append(1) or find(*a)
+        "turbrestore.registration.flow.normalise_to_8_bits",
+        lambda *a, find=flow.normalise_to_8_bits: calls.append(1) or find(*a),
     )
     frames = np.random.default_rng(0).random((3, 32, 32)).astype(np.float32)
     runtime = Runtime(scratch=tmp_path if scratch else None)

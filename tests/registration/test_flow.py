@@ -11,10 +11,10 @@ from turbrestore.registration.flow import (
     FLOW_METHODS,
     FlowParams,
     estimate_flow,
-    grey_levels,
     iterate_flows,
     measure_flows,
     normalise_contrast,
+    normalise_to_8_bits,
     prepare_reference,
 )
 from turbrestore.registration.opencv_flow import DisParams, FarnebackParams, dis_solver, flow_memory
@@ -233,19 +233,19 @@ def test_what_dis_does_with_a_start_and_for_a_draft(refinements, quarter, half):
     image, params = texture(size=64), FlowParams(confidence=False, dis=DisParams(refinements=refinements))
     frame, start = np.roll(image, 2, axis=1), np.full((1, 64, 64, 2), (1, 0), np.float32)
     target = prepare_reference(image, params)
-    levels = [target.prepare(one).levels for one in (image, frame)]
+    normalised = [target.prepare(one).normalised for one in (image, frame)]
     solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     solver.setVariationalRefinementAlpha(params.dis.smoothness)
     solver.setFinestScale(1)
     solver.setPatchStride(params.dis.patch_stride)
     solver.setVariationalRefinementIterations(half)
     draft = next(flow for _, flow in measure_flows(target, [frame], draft=True))
-    assert np.array_equal(draft, solver.calc(*levels, None))
+    assert np.array_equal(draft, solver.calc(*normalised, None))
     solver.setCoarsestScale(0)
     solver.setFinestScale(0)
     solver.setPatchStride(params.dis.patch_stride + 2)
     solver.setVariationalRefinementIterations(quarter)
-    assert np.array_equal(measure(target, [frame], start)[0], solver.calc(*levels, start[0].copy()))
+    assert np.array_equal(measure(target, [frame], start)[0], solver.calc(*normalised, start[0].copy()))
 
 
 def test_a_start_that_is_a_guess_is_searched_for_from_the_level_that_is_asked_for():
@@ -277,7 +277,8 @@ def test_tvl1_with_a_start_goes_through_two_levels():
     params = FlowParams(method="tvl1", confidence=False)
     found = measure(prepare_reference(reference, params), [frame], [truth])
     grey = [
-        prepare_reference(reference, params).prepare(image).levels.astype(np.float32) for image in (reference, frame)
+        prepare_reference(reference, params).prepare(image).normalised.astype(np.float32)
+        for image in (reference, frame)
     ]
     anew = prepare_tvl1(grey[0], TvL1Params(levels=2))
     assert np.array_equal(found[0], tvl1_flows(grey[1][None], anew, truth[None]).flows[0])
@@ -350,7 +351,7 @@ def test_noisy_frames_are_smoothed_for_the_flow():
     prepared = prepare_reference(reference).prepare(frame)
     assert prepared.noisy
     smoothed = cv2.GaussianBlur(frame, (0, 0), 1.0)
-    assert np.array_equal(prepared.levels, prepare_reference(reference).prepare(smoothed).levels)
+    assert np.array_equal(prepared.normalised, prepare_reference(reference).prepare(smoothed).normalised)
 
 
 def test_clean_frames_are_not_smoothed():
@@ -358,7 +359,7 @@ def test_clean_frames_are_not_smoothed():
     prepared = prepare_reference(reference).prepare(frame)
     assert not prepared.noisy
     assert np.array_equal(
-        prepared.levels, grey_levels(frame, FlowParams().contrast_window, FlowParams().contrast_floor)
+        prepared.normalised, normalise_to_8_bits(frame, FlowParams().contrast_window, FlowParams().contrast_floor)
     )
 
 

@@ -1,4 +1,3 @@
-from importlib.util import find_spec
 from itertools import pairwise
 
 import numpy as np
@@ -6,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
+from torch_devices import NO_TORCH
 
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.registration.flow import FlowParams, estimate_flow
@@ -24,7 +24,6 @@ from turbrestore.runtime.runtime import Runtime
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
 
 SIZE = 96
-NO_TORCH = pytest.mark.skipif(find_spec("torch") is None, reason="torch is not installed")
 DEVICES = ["cpu", pytest.param("cpu:0", marks=NO_TORCH)]
 INNER = slice(8, -8)
 

@@ -7,8 +7,8 @@ import pytest
 
 from conftest import make_sequence
 from turbrestore.core.errors import DataError
+from turbrestore.filtering.estimates import Gaussian, PixelGaussian
 from turbrestore.filtering.filter_records import FilterCheckpoint, FilterParams, FilterState, FrameRecord
-from turbrestore.filtering.kalman import Gaussian, PixelGaussian
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams
 from turbrestore.runs.checkpoint import load_checkpoint, save_checkpoint

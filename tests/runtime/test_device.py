@@ -3,19 +3,17 @@
 import subprocess
 import sys
 import textwrap
-from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from torch_devices import NO_TORCH
 
 from turbrestore.core.decision import Decision
 from turbrestore.core.errors import ConfigurationError
 from turbrestore.runtime import device as device_module
 from turbrestore.runtime.device import TORCH_BYTES, check_device, explain_device, find_device, memory_of, needs_torch
 from turbrestore.runtime.runtime import Runtime
-
-NO_TORCH = pytest.mark.skipif(find_spec("torch") is None, reason="torch is not installed")
 
 
 class TestChoice:

@@ -8,12 +8,12 @@ r : correlation of b of A with b of B in a window; ρ = 2 r / (1 + r) that of th
     Brown), as far as the frames tell
 g : share of the mean in a band of the result
 
-What stands in the scene is in both halves.  Noise is not, nor are waves, clouds, rain and what registration has torn;
+What belongs to the scene is in both halves.  Noise is not, nor are waves, clouds, rain and what registration has torn;
 deconvolution sharpens them all the same, and so do weights that follow sharpness.  Where ρ is low and the result has
 more energy in a band than the mean of the registered frames, ``g = (1 − ρ')(E / E₀ − 1)``, with ρ' and g between 0 and
 1, goes from the one to the other.  Where the halves agree, and where the result is smoother than the mean, it stays.
 
-Near an edge the windows of the bands hold the edge, on which the halves agree, and a ring behind it passes with it.
+Near an edge the windows of the bands hold the edge, on which the halves agree, and a ring behind it is not noticed.
 Flat parts are therefore looked at once more in small windows with sharp borders, each against its own mean: where the
 halves share nothing in a window that ends before the edge, the scene is flat to within the noise, and what the result
 varies by beyond the mean is rings or noise.  There all of the image is the mean's.

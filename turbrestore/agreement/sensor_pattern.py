@@ -1,4 +1,4 @@
-"""What stands on the sensor: columns, rows and lone pixels with an offset of their own, and dead columns and rows.
+"""Static patterns of the sensor: columns, rows and lone pixels with an offset of their own, dead columns and rows.
 
 Symbols
 -------
@@ -6,10 +6,10 @@ m, v : mean of the frames, and variance from one to the next, which shadows hard
 c : offset of a column: median over the rows of m minus m smoothed across the columns
 s : motion of the edges of the scene, pixels
 
-Stripes of the scene move with the air, so v exceeds n² by s² times the squared slope of c.  Those of the sensor stand,
-and v knows nothing of them.  They are subtracted from every frame; a column that does not change while others do is
-filled from beside it.  Rows are the columns of the transposed frames.  A warm pixel is one that stands out of m alone,
-which no detail does that moves, and does not vary by its height times the motion.
+Stripes of the scene move with the air, so v exceeds n² by s² times the squared slope of c.  Those of the sensor stay,
+and do not raise v.  They are subtracted from every frame; a column that does not change while others do is filled from
+beside it.  Rows are the columns of the transposed frames.  A warm pixel exceeds its surroundings in m by itself, as no
+detail does that moves, and does not vary by its height times the motion.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _ACROSS = 3.0
 # Least offset, in standard errors of the mean of the frames and in intensity, that is worth a correction.
 _CLEARLY, _LEAST = 4.0, 5e-4
 # Largest share, of the variance that stripes of the scene would have, of those of the sensor.
-_STANDS = 0.25
+_STATIC = 0.25
 # Gradient of the edges whose motion is measured, in deviations of the noise, and the least motion, pixels.
 _EDGE, _LEAST_MOTION = 8.0, 0.3
 # Parts along the stripes, and the least correlation of their offsets; offsets of a sensor, root mean square, are
@@ -100,7 +100,7 @@ def without_stripes(survey: Survey, moments: Moments | None = None) -> tuple[Sur
         *([f"{count} dead columns or rows filled from beside them"] if count else ()),
         *([f"{warm.sum()} warm pixels evened out"] if warm.any() else ()),
     ]
-    decision = Decision("sensor", "; ".join(kinds), "they stand while the air moves the scene")
+    decision = Decision("sensor", "; ".join(kinds), "they are static while the air moves the scene")
     return survey.adjusted(stripes.without), (decision,)
 
 
@@ -129,7 +129,7 @@ def _offsets(mean: FloatArray, variance: FloatArray, error: float, motion: float
     steep, flat = slope >= np.quantile(slope, 0.75), slope <= np.quantile(slope, 0.25)
     gained = float(np.median(level[steep]) - np.median(level[flat]))
     expected = motion**2 * float(np.median(slope[steep]) - np.median(slope[flat]))
-    return offsets if gained < _STANDS * expected else np.zeros_like(offsets)
+    return offsets if gained < _STATIC * expected else np.zeros_like(offsets)
 
 
 def _dead(variance: FloatArray, noise: float) -> NDArray[np.bool_]:
@@ -146,13 +146,13 @@ def _dead(variance: FloatArray, noise: float) -> NDArray[np.bool_]:
 
 
 def _warm(mean: FloatArray, variance: FloatArray, noise: float, motion: float) -> NDArray[np.bool_]:
-    """Mark pixels that stand out alone of what is around them, and stand."""
+    """Mark static pixels that differ, each alone, from what is around them."""
     height, least = _above_around(mean), max(_CLEARLY * noise, 2 * _LEAST)
     ring = np.ones((3, 3), np.uint8)
     ring[1, 1] = 0
     over = np.where(height > 0, mean - cv2.dilate(mean, ring), cv2.erode(mean, ring) - mean)
     alone = (np.abs(height) > least) & (over > _ALONE * np.abs(height))
-    warm = alone & (variance - noise**2 < _STANDS * (motion * height) ** 2)
+    warm = alone & (variance - noise**2 < _STATIC * (motion * height) ** 2)
     # Letters are drawn over the noise; a lone pixel among their strokes is one of them.
     smooth = cv2.medianBlur(mean, 3)
     slope = np.hypot(*sobel_gradient(smooth))

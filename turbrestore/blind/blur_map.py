@@ -112,9 +112,7 @@ def sigma_map(tiles: ArrayLike, shape: tuple[int, int]) -> FloatArray:
 
 
 def varying_deconvolution_steps(
-    attempt: Callable[[float], Steps[Deconvolution]],
-    sigmas: FloatArray,
-    runtime: Runtime = DEFAULT,
+    attempt: Callable[[float], Steps[Deconvolution]], sigmas: FloatArray, runtime: Runtime = DEFAULT
 ) -> Steps[Deconvolution]:
     """Deconvolve by a width for every pixel (H, W): by a few widths, between whose images is interpolated."""
     widths = _widths_between(float(sigmas.min()), float(sigmas.max()))

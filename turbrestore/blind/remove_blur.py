@@ -22,12 +22,7 @@ from ..blur.witnesses.image_evidence import image_evidence
 from ..core.arrays import FloatArray, check_image, luminance
 from ..core.decision import Decision
 from ..core.noise import NoiseCurve
-from ..deconvolution.deconvolve import (
-    Deconvolution,
-    DeconvolutionParams,
-    deconvolve_steps,
-    whole_image_fidelity,
-)
+from ..deconvolution.deconvolve import Deconvolution, DeconvolutionParams, deconvolve_steps, whole_image_fidelity
 from ..deconvolution.memory import deconvolution_memory
 from ..deconvolution.problem import read_blur
 from ..deconvolution.stopping import Steps

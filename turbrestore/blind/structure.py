@@ -38,7 +38,7 @@ _SCALE = 2.0
 _EDGE, _CLEAR, _GRADIENT_NOISE = 0.1, 6.0, 0.05
 # Cosine of the angle within which gradients have one direction.
 _ALIKE = 0.7
-# Percentile of the gradients that stands for the steepest.
+# Percentile of the gradients that is taken for the steepest.
 _STEEPEST = 99
 # Frames that are compared, windows along an axis and their side, pixels; pixels at the border that are left out.
 _FRAMES, _WINDOWS, _SIDE, _BORDER = 15, 4, 256, 12

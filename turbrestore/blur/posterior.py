@@ -3,7 +3,7 @@
 Symbols
 -------
 D/r0, λ/D : strength of the air, and diffraction, pixels
-σ_l : width of a Gaussian, which stands for the lens, the pixels, the codec and what registration leaves, pixels
+σ_l : width of a Gaussian for the blur of the lens, the pixels, the codec and what registration leaves, pixels
 H : transfer function, ``H_air(ν; D/r0, λ/D) exp(−2π² σ_l² ν²)`` (:mod:`.witnesses.short_exposure`)
 V : variance of the displacement along one axis, squared pixels
 s, s_4, ε : variation of the spectra, and stretch by the registration (:mod:`.witnesses.spectral_variation`)
@@ -64,7 +64,7 @@ _LEAST_REMOVED, _SURELY = 0.5, 0.8
 _WIDEST, _REDUCTIONS = 3.0, (2, 4)
 # Widths that are reported.
 _QUANTILES = (0.16, 0.5, 0.84)
-# Range of ln V of air that does not blur, V below which a scene stands still, and the least V, squared pixels.
+# Range of ln V of air that does not blur, V below which a scene counts as static, and the least V, squared pixels.
 _RANGE_OF_V, _STILL, _LEAST_V = 7.0, 0.03, 1e-3
 # g and τ: values, and mean and standard deviation of the logarithm.
 _SHARES, SHARE_PRIOR = np.exp([-2.2, -1.6, -1.1, -0.7, -0.3]), (-1.1, 0.5)

@@ -175,12 +175,7 @@ def _blur_of_tiles(
 
 
 def _fit_relative(
-    power: Float64Array,
-    reference: Float64Array,
-    design: Float64Array,
-    s: Float64Array,
-    misfit: Float64Array,
-    fit: _Fit,
+    power: Float64Array, reference: Float64Array, design: Float64Array, s: Float64Array, misfit: Float64Array, fit: _Fit
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Fit s, shape (T, tiles), of frames to a reference with much less noise; q = s · design.
 

@@ -31,7 +31,7 @@ from numpy.typing import ArrayLike
 from scipy.special import comb
 
 from ..core.errors import ConfigurationError, DataError, require
-from ..filtering.kalman import Gaussian
+from ..filtering.estimates import Gaussian
 from .sensor import ExposureTable, Float64Array, GaussianKernel, LineSensor, PixelGrid, tabulate
 from .state_estimation.augmented import OscillatorMotion
 from .state_estimation.lifting import LiftedSystem
@@ -71,11 +71,7 @@ class BlurModel:
 
 
 def predicted_moments(
-    model: BlurModel,
-    mean: Float64Array,
-    inputs: Float64Array,
-    orders: tuple[int, ...],
-    basis: str = "monomial",
+    model: BlurModel, mean: Float64Array, inputs: Float64Array, orders: tuple[int, ...], basis: str = "monomial"
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Predict the moments h(x̂) from a state, with their derivative and the covariance of their noise.
 

@@ -24,7 +24,8 @@ from scipy.optimize import minimize_scalar
 
 from ..core.arrays import check_frames, luminance
 from ..core.errors import ConfigurationError, DataError, require, require_between
-from ..filtering.kalman import Gaussian, Innovation
+from ..filtering.estimates import Gaussian
+from ..filtering.kalman import Innovation
 from .moments import BlurModel
 from .sensor import ExposureTiming, Float64Array, GaussianKernel, LineSensor, PixelGrid
 from .state_estimation.lifting import LiftedSystem
@@ -209,12 +210,7 @@ def _run(windows: _Windows, params: TrackParams) -> tuple[Gaussian, Float64Array
 
 
 def _follow(
-    windows: _Windows,
-    axis: int,
-    start: Gaussian,
-    motion: LiftedSystem,
-    kernel: GaussianKernel,
-    observer: MomentFilter,
+    windows: _Windows, axis: int, start: Gaussian, motion: LiftedSystem, kernel: GaussianKernel, observer: MomentFilter
 ) -> list[tuple[Gaussian, Innovation]]:
     """States of one axis after each frame, and innovations."""
     lines, summed = windows.images.sum(axis=1 + axis), windows.images.shape[1 + axis]

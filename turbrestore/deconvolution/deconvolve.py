@@ -299,11 +299,7 @@ def join_planes(image: FloatArray, planes: list[FloatArray], channels: str) -> F
 
 
 def _solve(
-    problems: list[Problem],
-    guide: FloatArray | None,
-    measured: Stack,
-    params: DeconvolutionParams,
-    team: ThreadTeam,
+    problems: list[Problem], guide: FloatArray | None, measured: Stack, params: DeconvolutionParams, team: ThreadTeam
 ) -> Steps[Solution]:
     stop = measured, params.iterations, params.tolerance
     if params.method in ("wiener", "tikhonov"):

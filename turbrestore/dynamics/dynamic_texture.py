@@ -102,9 +102,7 @@ class DynamicsParams:
 
 @one_thread_each()
 def identify(
-    flows: FloatArray | Iterable[FloatArray],
-    params: DynamicsParams | None = None,
-    runtime: Runtime = DEFAULT,
+    flows: FloatArray | Iterable[FloatArray], params: DynamicsParams | None = None, runtime: Runtime = DEFAULT
 ) -> FlowDynamics:
     """Identify the dynamic texture model from a training sequence of flows (paper 3, sections 3.1 and 3.2).
 
@@ -312,11 +310,7 @@ def singular_vectors(gram: Float64Array) -> tuple[Float64Array, Float64Array]:
 
 
 def spatial_modes(
-    strips: FlowStrips,
-    mean: FloatArray,
-    singular_values: Float64Array,
-    V: Float64Array,
-    scratch: Path | None = None,
+    strips: FlowStrips, mean: FloatArray, singular_values: Float64Array, V: Float64Array, scratch: Path | None = None
 ) -> tuple[FloatArray, Float64Array]:
     """C = X V Σ⁻¹ and the energy outside its subspace, strip by strip.
 

@@ -1,17 +1,16 @@
 """Alternating-estimation Kalman filter over the image and the state of its flow (paper 3, section 4).
 
-Symbols as in :mod:`turbrestore.filtering.kalman`, which has eqs. 14 to 19; Ŵ is the flow that frames are registered
-by, and β the weight of sharpness, given or chosen by :mod:`turbrestore.filtering.frame_statistics`.
+Symbols as in :mod:`turbrestore.filtering.image_state` (ρ̂, Σ, Z) and :mod:`turbrestore.filtering.flow_state` (ξ̂, P);
+Ŵ is the flow that frames are registered by, and β the weight of sharpness, given or chosen by
+:mod:`turbrestore.filtering.frame_statistics`.
 
 Given Ŵ the image is a linear state, given ρ the flow is, so each frame updates one after the other:
 
-1. predict ρ̂ and ξ̂ (eq. 14);
-2. measure W^meas from the image to the frame and update ξ̂ (eqs. 17, 19);
-3. warp the frame by Ŵ and update ρ̂ (eqs. 15, 16);
+1. predict ρ̂ (eqs. 14a, 14c: ``image_state.predict_image``) and ξ̂ (eqs. 14b, 14d: ``flow_state.advance_flow_state``);
+2. measure W^meas from the image to the frame (eq. 17: ``frame_pass``) and update ξ̂ (eqs. 18, 19:
+   ``flow_state.update_flow_state``);
+3. warp the frame by Ŵ (eq. 15: ``frame_noise.register_frame``) and update ρ̂ (eq. 16: ``image_state.update_image``);
 4. return to 2 with the new image, ``inner_iterations`` times in all.
-
-Z (eq. 15) is in :mod:`turbrestore.filtering.frame_noise`; :mod:`turbrestore.filtering.frame_pass` measures, follows and
-registers the frames of one iteration.
 
 Departures from the paper, each with its reason:
 
@@ -54,17 +53,12 @@ from ..runtime.device import find_device, memory_of
 from ..runtime.image_stacks import load, load_image, load_record, store, store_image
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
-from .filter_records import (
-    FilterCheckpoint,
-    Filtered,
-    FilterParams,
-    FilterState,
-    FilterStep,
-    FrameRecord,
-)
+from .estimates import Gaussian, PixelGaussian, PixelStacks, first_estimates
+from .filter_records import FilterCheckpoint, Filtered, FilterParams, FilterState, FilterStep, FrameRecord
+from .flow_state import flow_noise
 from .frame_pass import Frame, PassSettings, TrackedFrame, pass_over, register
 from .frame_statistics import measure_frame_statistics
-from .kalman import Gaussian, PixelGaussian, PixelStacks, first_states, flow_noise, update_pixels
+from .image_state import predict_image, update_image
 
 # Variance of an image of which nothing is known: full scale, squared.
 _DIFFUSE = 1.0
@@ -216,11 +210,7 @@ def _filter_blocks(
 
 
 def _iterate(
-    at: _Position,
-    settings: PassSettings,
-    known: Flows,
-    last: bool = False,
-    following: Iterable[FloatArray | None] = (),
+    at: _Position, settings: PassSettings, known: Flows, last: bool = False, following: Iterable[FloatArray | None] = ()
 ) -> Generator[FilterStep, None, _Position]:
     """Run one pass over the block that has begun, and over the frames that follow it; ``last`` settles the block."""
     settled = len(at.block) if last else 0
@@ -231,7 +221,7 @@ def _iterate(
     flow_sum = at.state.flow_sum.copy() if last else at.state.flow_sum
     flow, records, block, flows_measured = at.state.flow, list(at.records), deque[Frame](), at.flows_measured
     for number, tracked in enumerate(pass_over(frames, known_flows, reference, at.state.flow, settled, settings)):
-        image, record = _update_image(image, tracked, settings)
+        image, record = _advance_image(image, tracked, settings)
         if number < settled:
             settled_image, flow = image, tracked.state
             records.append(record)
@@ -247,14 +237,17 @@ def _iterate(
     return _Position(state, tuple(records), store_image(image.mean), block, flows_measured)
 
 
-def _update_image(image: PixelStacks, tracked: TrackedFrame, settings: PassSettings) -> tuple[PixelStacks, FrameRecord]:
-    """Predict the image, and update it by a frame that counts (eqs. 14a, 14c, 15 and 16)."""
-    frame = tracked.registered or register(tracked, settings)
+def _advance_image(
+    image: PixelStacks, tracked: TrackedFrame, settings: PassSettings
+) -> tuple[PixelStacks, FrameRecord]:
+    """Predict the image (eq. 14), and update it by a frame that counts (eqs. 15, 16)."""
+    frame, predicted = (
+        tracked.registered or register(tracked, settings),
+        predict_image(image, settings.params.image_drift),
+    )
     if frame is None:
-        # The scene drifts on although nothing is measured (14c).
-        image = image._replace(variance=image.variance + settings.params.image_drift)
-        return image, FrameRecord(tracked.state.mean, 0.0, tracked.innovation, np.nan, 0.0)
-    image, gains = update_pixels(image, frame.channels, frame.noise, settings.params.image_drift)
+        return predicted, FrameRecord(tracked.state.mean, 0.0, tracked.innovation, np.nan, 0.0)
+    image, gains = update_image(predicted, frame.channels, frame.noise)
     gain, information = float(gains.mean()), float((1 / frame.noise).mean())
     return image, FrameRecord(tracked.state.mean, gain, tracked.innovation, frame.sharpness, information)
 
@@ -293,7 +286,7 @@ def _measure_settings(
 def _prior(image: FloatArray, image_noise: float, dynamics: FlowDynamics, params: FilterParams) -> FilterState:
     """State before the first frame."""
     variance = image_noise / params.prior_frames if params.prior_frames else _DIFFUSE
-    return FilterState(*first_states(image, variance, dynamics), *np.zeros((2, *image.shape[:2], 2), np.float32))
+    return FilterState(*first_estimates(image, variance, dynamics), *np.zeros((2, *image.shape[:2], 2), np.float32))
 
 
 def _after_training(

@@ -16,7 +16,7 @@ from ..display.curves import plot_frames
 from ..display.preview import preview
 from ..registration.recentring import recentring_flow
 from ..registration.warp import warp
-from .kalman import Gaussian, PixelGaussian
+from .estimates import Gaussian, PixelGaussian
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -65,7 +65,7 @@ class FrameStatistics:
     template_energy: float  # sum of its square
     # (H, W): mean over the frames of the local sharpness where they agree, see :func:`project_gradient`.
     mean_sharpness: Stack
-    score_scale: Stack  # (H, W): factor from a deviation of the local sharpness to z; 0 where something has passed
+    score_scale: Stack  # (H, W): factor from a deviation of the local sharpness to z; 0 where an object has moved
     score_variance: Stack  # (H, W): v, variance of z over the frames
     window: float  # standard deviation of the Gaussian window in which sharpness is measured, pixels
     left_out: float  # κ, 0 to 1/4

@@ -1,6 +1,6 @@
 """One pass over consecutive frames: measure flows, update the flow state, register frames (paper 3, section 4).
 
-Symbols as in :mod:`turbrestore.filtering.kalman` and :mod:`turbrestore.filtering.frame_noise`.
+Symbols as in :mod:`turbrestore.filtering.flow_state` and :mod:`turbrestore.filtering.frame_noise`.
 
 Threads measure and project the flows of several frames in parallel.  The flow state is then updated by one frame after
 another, and the frames are registered in parallel again.  On a torch device a frame is registered only when the image
@@ -23,9 +23,10 @@ from ..runtime.device import CPU
 from ..runtime.runtime import Runtime
 from ..runtime.scratch import iter_frames
 from ..runtime.threads import in_batches, map_in_turns
+from .estimates import Gaussian
 from .filter_records import FilterParams
+from .flow_state import advance_flow_state
 from .frame_noise import FrameStatistics, RegisteredFrame, register_frame
-from .kalman import Gaussian, advance_state
 
 # A frame as it was read, or prepared for flow; None for a frame that does not count.
 Frame = FloatArray | FlowFrame | None
@@ -93,7 +94,7 @@ def pass_over(
         nonlocal state
         updated = []
         for item in items:
-            state, innovation = advance_state(state, item.projected, dynamics)  # (14b, 14d, 17, 19)
+            state, innovation = advance_flow_state(state, item.projected, dynamics)
             updated.append(replace(item, state=state, innovation=innovation))
         return updated
 

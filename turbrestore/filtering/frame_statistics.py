@@ -6,7 +6,7 @@ Z₀ : variance of a registered frame about the image before sharpness is taken 
 β : weight of sharpness; κ what its window leaves out, see :func:`turbrestore.filtering.frame_noise.local_sharpness`
 
 All frames are warped twice: for mean and variance, and again to leave out what deviates.  Some are warped once more,
-for a median that what passes does not change.
+for a median, which moving objects do not change.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _LEAST_SPREAD = 0.03
 # Share of the mean variance by which every pixel varies at least.
 _LEAST_DEVIATION = 0.1
 # Frames of which the median is taken, the rows that it is taken of at once, the factor from a median deviation to a
-# standard deviation, and how many times the variance exceeds its robust estimate where something has passed.
+# standard deviation, and how many times the variance exceeds its robust estimate where an object has moved.
 _RESERVOIR, _ROWS, _MEDIAN_DEVIATION, _HEAVY_TAIL = 25, 64, 1.4826, 4.0
 # Variance of a Sobel derivative (divided by 8) of white noise of unit variance, and the pixels over which such
 # derivatives correlate.
@@ -89,17 +89,17 @@ def measure_frame_statistics(
     mean, variance = _mean_and_variance(total, squares, count)
     variance *= count / max(count - 1, 1)
     centre, usual, fine = _median_and_spread(frames, flows, mean.shape, int(count), threads)
-    mean, variance, passed = _robust_start(mean, variance, centre, usual)
+    mean, variance, covered = _robust_start(mean, variance, centre, usual)
 
     square = template[0] ** 2 + template[1] ** 2
     energy = smooth(square, window)
-    sensor_noise = fit_noise_curve(mean, np.where(passed, variance, fine), energy).variance(mean)
+    sensor_noise = fit_noise_curve(mean, np.where(covered, variance, fine), energy).variance(mean)
     mean_frame, deviation, moments = _without_outliers(frames, flows, mean, variance, template, window, threads)
     sharpness, spread, explained, left_out = _leave_middle_out(moments, template, energy, sensor_noise, window)
     scale = _score_scale(sharpness, spread, explained)
     weight = _sharpness_weight(sharpness, spread - explained, scale**2 * spread, float(sensor_noise.mean()) / count)
-    # Near what passes flow is pulled along, and a frame may be sharp without showing the scene.
-    scale *= 1 - smooth(passed.astype(np.float32), window)
+    # Near a moving object the flow follows it, and a frame may be sharp without showing the scene.
+    scale *= 1 - smooth(covered.astype(np.float32), window)
     return FrameStatistics(
         image_noise=max(float(variance.mean()) if image_noise is None else image_noise, _IMAGE_NOISE_FLOOR),
         template=template,
@@ -174,14 +174,14 @@ def _middle(ordered: FloatArray) -> FloatArray:
 def _robust_start(
     mean: np.ndarray, variance: np.ndarray, centre: FloatArray, spread: FloatArray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean and variance, but median and squared median deviation where something has passed; mark these pixels too.
+    """Mean and variance, or median and squared median deviation where objects have moved; mark these pixels too.
 
-    What covers a pixel in a share p of the frames lies (1 − p) / p variances from the mean, and is no outlier if p
-    exceeds a seventh.  The median and the median deviation hardly know of it up to p = 0.3.
+    An object that covers a pixel in a share p of the frames lies (1 − p) / p variances from the mean, and is no outlier
+    if p exceeds a seventh.  The median and the median deviation hardly change up to p = 0.3.
     """
     usual = smooth(spread, OUTLIER_WINDOW) + np.float32(_IMAGE_NOISE_FLOOR)
-    passed = smooth(variance.astype(np.float32), OUTLIER_WINDOW) > _HEAVY_TAIL * usual
-    return np.where(passed, centre, mean), np.where(passed, spread, variance), passed
+    covered = smooth(variance.astype(np.float32), OUTLIER_WINDOW) > _HEAVY_TAIL * usual
+    return np.where(covered, centre, mean), np.where(covered, spread, variance), covered
 
 
 def _without_outliers(
@@ -195,7 +195,7 @@ def _without_outliers(
 ) -> tuple[FloatArray, FloatArray, _SharpnessMoments]:
     """Mean and variance of the registered frames, and of their sharpness, without pixels that deviate from all others.
 
-    What passes through the scene may be sharper than the scene, and would set the standard of sharpness.
+    A moving object may be sharper than the scene, and would set the standard of sharpness.
     """
     centre, usual = mean.astype(np.float32), _deviation(variance)
 
@@ -231,11 +231,7 @@ def _deviation(variance: np.ndarray, window: float = OUTLIER_WINDOW) -> FloatArr
 
 
 def _leave_middle_out(
-    moments: _SharpnessMoments,
-    template: FloatArray,
-    energy: FloatArray,
-    noise: FloatArray,
-    window: float,
+    moments: _SharpnessMoments, template: FloatArray, energy: FloatArray, noise: FloatArray, window: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Mean and variance of the local sharpness, the part of the variance that noise explains, and κ.
 

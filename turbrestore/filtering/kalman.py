@@ -1,31 +1,14 @@
-"""Kalman filter: prediction, measurement update in covariance and in information form, and the updates of paper 3.
+"""Kalman filter of a linear state: prediction, and measurement update in covariance and in information form.
 
-The equations of paper 3, section 4, of the image and of the state of its flow::
-
-    ρ̂ ← ρ̂,  ξ̂ ← A ξ̂                                           (14a, b)
-    Σ ← Σ + S,  P ← A P Aᵀ + Q                                 (14c, d)
-    I ∘ ŵ = ρ + ζ,  ζ ~ N(0, Z)                                (15)
-    ρ̂ ← ρ̂ + L (I ∘ ŵ − ρ̂),  Σ ← (1 − L) Σ,  L = Σ / (Σ + Z)   (16)
-    W^meas = W̄ + C ξ + r,  r ~ N(0, R)                         (17)
-    ξ̂ ← ξ̂ + M (W^meas − W̄ − C ξ̂),  P ← (I − M C) P
-    M = P Cᵀ (C P Cᵀ + R)⁻¹                                    (18)
-    M = (CᵀR⁻¹C + P⁻¹)⁻¹ CᵀR⁻¹                                 (19)
+Equations (14), (17), (18) and (19) are those of :mod:`turbrestore.filtering.flow_state`, with any measurement z in the
+place of the flow less its mean, and its matrix H in the place of C; the observers of blur moments use them as well.
 
 Symbols
 -------
-ρ̂, Σ : image and its variance; S, Z : variance of its drift, and of a registered frame I ∘ ŵ about it
 ξ̂, P : mean and covariance of the state
-A, C, Q, R, W̄ : flow model of :mod:`turbrestore.dynamics.flow_model`; W^meas : measured flow
-L, M : gains
-z, H, R : measurement, its matrix and the covariance of its noise, where the state is any other
-
-The paper takes Σ, Z and L to be one number each; here they vary from pixel to pixel.  Pixels are independent of each
-other, and channels share the variance.
-
-The paper measures the flow by C ξ alone (eq. 17); here W̄ is added, as the states are identified around the mean flow.
-As CᵀC = I and R is one number, (19) reads ``M = (I/R + P⁻¹)⁻¹ Cᵀ/R``: a measured flow enters the update only through
-``z = Cᵀ(W^meas − W̄)``, which is a measurement of ξ itself with noise R I.  So each flow is projected once, which is the
-expensive part and needs no state, and predictions and updates have the size n.
+A, Q : transition of the state, and covariance of its noise
+z, H, R : measurement ``z = H ξ + r``, its matrix, and the covariance of its noise r
+M : gain
 
 Matrix operations act on the last two axes, so leading axes are batches and broadcast.  A component of a measurement
 that is NaN is missing.
@@ -34,40 +17,15 @@ that is NaN is missing.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray
 from ..core.errors import DataError
-from ..dynamics.flow_model import Float64Array, FlowDynamics, ProjectedFlow
-from ..runtime.image_stacks import Stack
+from ..dynamics.flow_model import Float64Array
+from .estimates import Gaussian, check_batches, check_covariance, check_matrix, cholesky
 
 _LOG_2PI = float(np.log(2 * np.pi))
-# Smallest variance of the flow, so that noise-free synthetic data keep every gain defined: (0.001 px)².
-_FLOW_NOISE_FLOOR = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class Gaussian:
-    """Mean and covariance of a state."""
-
-    mean: Float64Array  # (..., n): ξ̂
-    # (..., n, n): P, symmetric positive semi-definite. Its leading axes may be fewer than those of the mean: one
-    # covariance then holds for all of them.
-    cov: Float64Array
-
-    def __post_init__(self) -> None:
-        mean, cov = np.asarray(self.mean, np.float64), np.asarray(self.cov, np.float64)
-        if mean.ndim < 1:
-            raise DataError("mean: expected shape (..., n), found a single number")
-        if not np.isfinite(mean).all():
-            raise DataError("mean: expected finite values, found NaN or infinite ones; the filter may be unstable")
-        _check_covariance(cov, mean.shape[-1], "cov")
-        _check_batches(mean.shape[:-1], cov=cov.shape[:-2])
-        object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "cov", cov)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,24 +47,22 @@ class Innovation:
 
 
 def predict(state: Gaussian, A: ArrayLike, Q: ArrayLike) -> Gaussian:
-    """Time update: A ξ̂ (paper 3, eq. 14b) and A P Aᵀ + Q (eq. 14d), with A and Q of shape (..., n, n)."""
+    """Predict the state one step ahead: A ξ̂ (14b) and A P Aᵀ + Q (14d), with A and Q of shape (..., n, n)."""
     n = state.mean.shape[-1]
     A, Q = np.asarray(A, np.float64), np.asarray(Q, np.float64)
-    _check_matrix(A, n, n, "A")
-    _check_covariance(Q, n, "Q")
-    _check_batches(state.mean.shape[:-1], A=A.shape[:-2], Q=Q.shape[:-2])
+    check_matrix(A, n, n, "A")
+    check_covariance(Q, n, "Q")
+    check_batches(state.mean.shape[:-1], A=A.shape[:-2], Q=Q.shape[:-2])
     # Gaussian raises a DataError where the result overflows, so NumPy need not warn.
     with np.errstate(over="ignore", invalid="ignore"):
         return Gaussian(_apply(A, state.mean), _symmetric(A @ state.cov @ A.mT + Q))  # (14b), (14d)
 
 
-def update(
+def update_covariance_form(
     state: Gaussian, measurement: ArrayLike, H: ArrayLike, R: ArrayLike, predicted: ArrayLike | None = None
 ) -> tuple[Gaussian, Innovation]:
-    """Measurement update in covariance form, for few components (paper 3, eqs. 17 and 18).
+    """Update the state by a measurement (17) with the gain of (18), which suits few components.
 
-    The observers of blur moments use this form, with the gain of eq. 18; the alternating filter uses the information
-    form of eq. 19.
     The new covariance is Joseph's ``(I − M H) P (I − M H)ᵀ + M R Mᵀ`` where the paper has ``(I − M H) P``: both are the
     same in exact arithmetic, but only the first stays symmetric and positive semi-definite in floating point.
     ``measurement`` (..., m); ``H`` (..., m, n); ``R`` (..., m, m); ``predicted`` (..., m).
@@ -114,8 +70,8 @@ def update(
     n = state.mean.shape[-1]
     z, H, R = np.asarray(measurement, np.float64), np.asarray(H, np.float64), np.asarray(R, np.float64)
     m = _check_measurement(z, H, n)
-    _check_covariance(R, m, "R")
-    _check_batches(state.mean.shape[:-1], measurement=z.shape[:-1], H=H.shape[:-2], R=R.shape[:-2])
+    check_covariance(R, m, "R")
+    check_batches(state.mean.shape[:-1], measurement=z.shape[:-1], H=H.shape[:-2], R=R.shape[:-2])
     residual = z - (_apply(H, state.mean) if predicted is None else np.asarray(predicted, np.float64))
     missing = np.isnan(z)
     if missing.any():
@@ -125,7 +81,7 @@ def update(
         R = np.where(missing[..., None] | missing[..., None, :], np.eye(m), R)
     HP = H @ state.cov
     S = _symmetric(HP @ H.mT + R)
-    lower = _cholesky(S, "innovation covariance H P Hᵀ + R", "positive definite")
+    lower = cholesky(S, "innovation covariance H P Hᵀ + R", "positive definite")
     M = np.asarray(np.linalg.solve(S, HP), np.float64).mT  # P Hᵀ (H P Hᵀ + R)⁻¹, (18)
     F = np.eye(n) - M @ H
     after = Gaussian(state.mean + _apply(M, residual), _symmetric(F @ state.cov @ F.mT + M @ R @ M.mT))
@@ -138,10 +94,10 @@ def update(
     return after, _innovation(residual, S, squared, log_det, observed)
 
 
-def update_information(
+def update_information_form(
     state: Gaussian, measurement: ArrayLike, H: ArrayLike, noise_variance: ArrayLike
 ) -> tuple[Gaussian, Innovation]:
-    """Measurement update in information form, for many components and few states (paper 3, eq. 19).
+    """Update the state by a measurement (17) with the gain of (19), which suits many components and few states.
 
     ``M = (G + P⁻¹)⁻¹ Hᵀ R⁻¹`` with ``G = Hᵀ R⁻¹ H``: only n×n matrices are decomposed. With ``P = L Lᵀ`` and ``Lᵀ G L =
     V D Vᵀ`` the new covariance is ``T Tᵀ``, ``T = L V (I + D)^(-1/2)``: P may be singular, and the result is symmetric
@@ -151,7 +107,7 @@ def update_information(
     n = state.mean.shape[-1]
     z, H = np.asarray(measurement, np.float64), np.asarray(H, np.float64)
     m = _check_measurement(z, H, n)
-    _check_batches(state.mean.shape[:-1], measurement=z.shape[:-1], H=H.shape[:-2])
+    check_batches(state.mean.shape[:-1], measurement=z.shape[:-1], H=H.shape[:-2])
     variance = np.asarray(noise_variance, np.float64)
     if variance.shape not in ((), (m,)):
         raise DataError(f"noise_variance: expected one number or shape ({m},), found shape {variance.shape}")
@@ -183,11 +139,7 @@ def _posterior_root(P: Float64Array, G: Float64Array) -> tuple[Float64Array, Flo
 
 
 def _innovation(
-    values: Float64Array,
-    cov: Float64Array,
-    squared: Float64Array,
-    log_det: Float64Array,
-    observed: NDArray[np.intp],
+    values: Float64Array, cov: Float64Array, squared: Float64Array, log_det: Float64Array, observed: NDArray[np.intp]
 ) -> Innovation:
     log_likelihood = -0.5 * (squared + log_det + observed * _LOG_2PI)
     return Innovation(values, cov, np.asarray(squared), np.asarray(log_likelihood), np.asarray(observed))
@@ -201,115 +153,10 @@ def _symmetric(matrix: Float64Array) -> Float64Array:
     return 0.5 * (matrix + matrix.mT)
 
 
-def _check_matrix(matrix: NDArray[np.floating], rows: int, columns: int, name: str) -> None:
-    if matrix.ndim < 2 or matrix.shape[-2:] != (rows, columns):
-        raise DataError(f"{name}: expected shape (..., {rows}, {columns}), found {matrix.shape}")
-
-
 def _check_measurement(z: NDArray[np.floating], H: NDArray[np.floating], n: int) -> int:
     if z.ndim < 1:
         raise DataError("measurement: expected shape (..., m), found a single number")
-    _check_matrix(H, z.shape[-1], n, "H")
+    check_matrix(H, z.shape[-1], n, "H")
     if np.isinf(z).any():
         raise DataError("measurement: expected finite values, or NaN where missing, found infinite ones")
     return int(z.shape[-1])
-
-
-def _check_covariance(cov: Float64Array, n: int, name: str) -> None:
-    _check_matrix(cov, n, n, name)
-    if not np.isfinite(cov).all():
-        raise DataError(f"{name}: expected finite values, found NaN or infinite ones; the filter may be unstable")
-    diagonal = np.abs(np.diagonal(cov, axis1=-2, axis2=-1))
-    scale = diagonal.max(-1, initial=0.0)[..., None]
-    if (np.abs(cov - cov.mT) > 1e-8 * scale[..., None]).any():
-        raise DataError(f"{name}: expected a symmetric matrix, found one that is not")
-    # Rounding may leave the eigenvalue of a known direction slightly negative; only more than that is an error.
-    slack = 1e-10 * diagonal + 1e-14 * scale + 1e-300
-    _cholesky(cov + slack[..., None] * np.eye(n), name, "positive semi-definite")
-
-
-def _check_batches(state: tuple[int, ...], **batches: tuple[int, ...]) -> None:
-    for name, batch in batches.items():
-        try:
-            np.broadcast_shapes(state, batch)
-        except ValueError:
-            raise DataError(
-                f"{name}: expected leading axes that fit those of the mean {state}, found {batch}"
-            ) from None
-
-
-def _cholesky(matrix: Float64Array, name: str, kind: str) -> Float64Array:
-    try:
-        return np.asarray(np.linalg.cholesky(matrix), np.float64)
-    except np.linalg.LinAlgError:
-        raise DataError(f"{name}: expected a {kind} matrix, found one that is not; check the covariances") from None
-
-
-def flow_noise(dynamics: FlowDynamics) -> float:
-    """R, squared pixels, with a floor for flows that lie in the subspace of the model as a whole."""
-    return max(dynamics.R, _FLOW_NOISE_FLOOR)
-
-
-def advance_state(state: Gaussian, measured: ProjectedFlow | None, dynamics: FlowDynamics) -> tuple[Gaussian, float]:
-    """Predict the state of the flow one frame ahead (paper 3, eqs. 14b and 14d), and update it by a measured flow."""
-    predicted = predict(state, dynamics.A, dynamics.Q)
-    return (predicted, np.nan) if measured is None else update_state(predicted, measured, dynamics)
-
-
-def update_state(predicted: Gaussian, measured: ProjectedFlow, dynamics: FlowDynamics) -> tuple[Gaussian, float]:
-    """Update the state of the flow by a measured flow (paper 3, eqs. 17 and 19)."""
-    # Cᵀ(W^meas − W̄) = ξ + noise of covariance R I, by CᵀC = I.
-    state, _ = update_information(predicted, measured.state, np.eye(len(measured.state)), flow_noise(dynamics))
-    # |W − W̄ − C ξ̂|² without the product C ξ̂.
-    squared = measured.squared - float(predicted.mean @ (2 * measured.state - predicted.mean))
-    return state, (max(squared, 0.0) / measured.size) ** 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class PixelGaussian:
-    """Mean and variance of every pixel."""
-
-    mean: NDArray[np.floating]  # (H, W) or (H, W, 3): ρ̂, intensities
-    variance: NDArray[np.floating]  # (H, W): Σ, squared intensities, not negative
-
-    def __post_init__(self) -> None:
-        mean = np.asarray(self.mean)
-        mean = mean if mean.dtype in (np.float32, np.float64) else mean.astype(np.float64)
-        variance = np.asarray(self.variance, mean.dtype)
-        pixels = variance.shape
-        if mean.shape not in (pixels, (*pixels, 3)):
-            raise DataError(f"mean: expected the shape of variance {pixels} or {(*pixels, 3)}, found {mean.shape}")
-        if not np.isfinite(np.sum(mean, dtype=np.float64)):
-            raise DataError("mean: expected finite values, found NaN or infinite ones")
-        if not np.isfinite(np.sum(variance, dtype=np.float64)) or (variance < 0).any():
-            raise DataError("variance: expected finite values of at least 0, found others")
-        object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "variance", variance)
-
-
-def first_states(image: FloatArray, variance: float, dynamics: FlowDynamics) -> tuple[PixelGaussian, Gaussian]:
-    """ρ̂, Σ and ξ̂, P before the first frame: an image (H, W) or (H, W, 3) of one variance, and the state 0.
-
-    The covariance P is that of the training states.
-    """
-    pixels, covariance = np.full(image.shape[:2], variance, np.float32), dynamics.state_covariance
-    return PixelGaussian(image, pixels), Gaussian(np.zeros(len(covariance)), covariance)
-
-
-class PixelStacks(NamedTuple):
-    """PixelGaussian as the device holds it, unchecked."""
-
-    mean: Stack  # (C, H, W): ρ̂
-    variance: Stack  # (H, W): Σ
-
-
-def update_pixels(state: PixelStacks, registered: Stack, noise: Stack, drift: float) -> tuple[PixelStacks, Stack]:
-    """Predict the image and update it by a registered frame (paper 3, eqs. 14a, 14c and 16).
-
-    ``registered`` (C, H, W); ``noise`` (H, W); returns ``gain`` (H, W).
-    """
-    prior = state.variance + drift  # (14c); by (14a) the mean stays
-    gain = prior / (prior + noise)  # L of (16)
-    mean = state.mean + gain * (registered - state.mean)  # (16)
-    # L Z equals (1 − L) Σ of (16) without its cancellation where Z is small.
-    return PixelStacks(mean, gain * noise), gain

@@ -20,7 +20,8 @@ from ..io.source import Window
 from .placement import relative_window
 from .survey import Survey
 
-# A bar is darker than that, even to that in place and time, and the picture beside it differs by that in that share.
+# Largest intensity of a bar, and largest range of it in place and time; least step to the picture beside it, intensity,
+# and least share of the length of the bar that has it.
 _DARK, _EVEN, _STEP, _SHARE = 0.12, 3.5 / 255, 0.02, 0.5
 # Narrowest bar, pixels, and least part of the frame that the picture takes.
 _NARROWEST, _LEAST_PICTURE = 2, 0.25
@@ -34,7 +35,7 @@ class Bars:
     frame: FloatArray  # (H, W) or (H, W, 3): mean of some frames, which has the bars
 
     def put_back(self, image: FloatArray, left: int = 0, top: int = 0) -> FloatArray:
-        """Give an image, whose first pixel is at (left, top) of the frame, its bars."""
+        """Put the bars back into an image whose first pixel is at (left, top) of the frame."""
         window = np.s_[top : top + len(image), left : left + image.shape[1]]
         outside = np.ones(self.frame.shape[:2], bool)
         outside[self.picture] = False
@@ -79,7 +80,7 @@ def without_bars(survey: Survey) -> tuple[Survey, Bars | None, tuple[Decision, .
 
 
 def _mirrored(inside: slice, length: int) -> NDArray[np.int_]:
-    """Places whose values continue what is inside to the whole length."""
+    """Continue what is inside to the whole length by mirroring; returns indices."""
     return np.pad(np.arange(inside.start, inside.stop), (inside.start, length - inside.stop), mode="symmetric")
 
 
@@ -97,7 +98,7 @@ def _extremes(survey: Survey) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _picture_of(shows: NDArray[Any], level: FloatArray) -> slice:
-    """Rows of the picture: all but those at either end that show nothing and that a step along the row ends."""
+    """Rows of the picture: all but even, dark ones at either end, if there is a step along the row beside them."""
     found = np.flatnonzero(shows)
     if not found.size:
         return slice(0, len(shows))

@@ -191,7 +191,7 @@ def _average(clip: FrameSource, source: FrameSource) -> NDArray[np.float64]:
 
 
 def _values(source: FrameSource, mean: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values of the file."""
+    """Bring mean intensities to the numbers of the file."""
     black, white = (0, source.full_scale) if source.levels is None else source.levels
     return mean * (white - black) + black
 

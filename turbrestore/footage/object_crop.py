@@ -22,7 +22,7 @@ from .checks.missing_pixels import fill_holes
 _SHARE, _SMOOTHING = 0.15, 2.0
 # Room around the object, as a share of its size and at least, pixels.
 _MARGIN, _LEAST_MARGIN = 0.2, 16
-# An object stands out of the noise of the field by so many standard deviations, and by two levels of 8 bits.
+# An object exceeds the noise of the field by so many standard deviations, and by two levels of 8 bits.
 _LEAST_CONTRAST, _LEAST_LEVELS = 8.0, 2 / 255
 # Cards that say where in the sky a pixel of a FITS image lies.
 _SKY = ("CRPIX", "CRVAL", "CTYPE", "CDELT", "CUNIT", "CROTA", "CD1_", "CD2_", "PC1_", "PC2_")
@@ -42,7 +42,7 @@ class ObjectPlace:
 
 
 def find_object(frame: FloatArray) -> ObjectPlace | None:
-    """Find the largest bright object of a frame; None where nothing stands out of the field.
+    """Find the largest bright object of a frame; None where nothing exceeds its noise.
 
     ``frame`` (H, W) or (H, W, 3).
     """

@@ -1,21 +1,21 @@
-"""What stands in the frame while the scene moves: a field stop, a reticle, a clock, bars beside the picture.
+"""Static overlays, which stay in place while the scene moves: a field stop, a reticle, a clock, bars, titles.
 
 Symbols
 -------
 mean, deviation : of the frames over time, at every pixel; where an edge of the mean moves by s pixels, the deviation is
     about s times the gradient of the mean
-s : shift of the scene in a frame, measured without what stands
+s : shift of the scene in a frame, measured without the overlay
 
 Pixels of an overlay are replaced in every frame by what other frames show of the scene at that place, moved by whole
 pixels.  Where none shows anything the scene around is continued smoothly, because an edge there would be taken for one
 of the scene.  Flow, fusion and deconvolution then see the scene alone.
 
-With a camera that stands no frame shows what is behind a title.  The scene moves all the same, by the pixel or two that
-the air bends it: every frame is continued over the overlay, whose pixels are put back into the result as they are in
-the mean of the frames.  A title lacks the noise of the camera, unless a coder has spread that over it; then its edges
+With a static camera no frame shows what is behind a title.  The scene moves all the same, by the pixel or two that the
+air bends it: every frame is continued over the overlay, whose pixels are put back into the result as they are in the
+mean of the frames.  A title lacks the noise of the camera, unless a coder has spread that over it; then its edges
 move less by an order of magnitude than those of the scene.
 
-The digits of a clock change, but from one frame to the next most of their strokes stand, as no edge does that the air
+The digits of a clock change, but from one frame to the next most of their strokes stay, as no edge does that the air
 moves.  Where an overlay has been found, the places of such strokes belong to it.
 """
 
@@ -44,44 +44,44 @@ from .survey import Moments, Survey, measure_moments
 FEWEST, _MOST = 3, 1500
 # Root mean square of the shifts from which a scene moves, pixels.
 _LEAST_MOTION = 3.0
-# An edge stands if it varies by less than its gradient times this share of the motion of the edges, or one pixel, and
-# if its gradient is that many times the noise; with a camera that stands, the edges move by at least so many pixels.
-_STANDS, _DEVIATIONS, _LEAST_BENDING = 1 / 3, 8.0, 0.3
-# Deviation of a pixel that stands, in units of the noise of a frame, and the least in intensity.
+# An edge is static if it varies by less than its gradient times this share of the motion of the edges, or one pixel,
+# and if its gradient is that many times the noise; with a static camera, the edges move by at least so many pixels.
+_STATIC, _DEVIATIONS, _LEAST_BENDING = 1 / 3, 8.0, 0.3
+# Deviation of a static pixel, in units of the noise of a frame, and the least in intensity.
 _STILL, _LEAST_STILL = 2.5, 1 / 255
-# Deviation of what has no noise, in units of the noise, and how dark a stop is between black and the scene.
+# Largest deviation of pixels without noise, in units of the noise, and level of a dark stop, from black to the scene.
 _CONSTANT, _DARK = 0.5, 0.25
-# Fewest standing edge pixels of an overlay, as a share of the frame, and the largest part of a frame that it may cover.
+# Fewest static edge pixels of an overlay, as a share of the frame, and the largest part of a frame that it may cover.
 _LEAST_EDGES, _LARGEST = 0.0005, 0.7
-# Share of the frame that no frame shows from which it is reported.
+# Least share of the scene, shown by no frame, that the decision states.
 _REPORTED = 0.002
 # Pixels around an overlay that are replaced too, reach of the fill under which shifts are measured, and the share of a
 # reduced pixel beside an overlay that has to show the scene.
 _AROUND, _REACH, _FREE = 2, 12.0, 0.9
-# With a camera that stands: radius around standing edges in which what has no noise belongs to them, and of the gaps
+# With a static camera: radius around static edges in which what has no noise belongs to them, and of the gaps
 # between letters; pixels around them over which the overlay fades.
 _NEAR, _GAP, _FADE = 4, 2, 0.7
 # An edge is drawn over the scene if its deviation is below that of the noise by this factor, or its motion below that
 # of the edges of the scene by this one.
 _NOISELESS, _DRAWN = 0.7, 1 / 8
-# Strokes of a clock: least change of a pixel, in units of the noise and in intensity, that is one; least share of the
-# frames that have an edge there, and of these in which it stands; fewest pixels that belong together.
+# Strokes of a clock: largest change of a pixel that stays, in units of the noise and in intensity; least share of the
+# frames that have an edge there, and of these in which it stays; fewest connected pixels.
 _SAME, _LEAST_SAME, _OFTEN, _REMAINS, _FEWEST_STROKES = 1.0, 1.5 / 255, 0.2, 0.25, 12
-# Fewest frames in which it stands, and the share that 10 % of the edges exceed in a scene that moves by a pixel.
+# Fewest frames in which it stays, and the share that 10 % of the edges exceed in a scene that moves by a pixel.
 _TIMES, _USUAL, _ALMOST_USUAL = 2, 0.15, 1.5
 # Largest part of the frame that digits take.
 _MOST_DIGITS = 0.1
-# Pixels beside others in which fewer frames need to have it.
+# Distance from other strokes, pixels, within which a stroke may stay in fewer frames, and the least share of them.
 _BESIDE, _REMAINS_BESIDE = 8, 0.18
-# Distance of digits from what stands all the time: at most one line in so many of the height of the frame.
+# Largest distance of digits from an overlay: the height of the frame over this.
 _LINE = 10
-# Most frames in which they are looked for.
+# Most frames in which strokes are looked for.
 _LOOKED_AT = 60
 
 
 @dataclass(frozen=True, eq=False)
 class Overlay:
-    """Pixels that stand, and what is behind them."""
+    """Static pixels, and the scene behind them."""
 
     mask: NDArray[np.bool_]  # (H, W)
     scene: FloatArray  # (H', W') or (H', W', 3): mean of the frames at one place, without the overlay
@@ -90,7 +90,7 @@ class Overlay:
     window: Window  # rows and columns of the file that the mask spans
 
     def without(self, number: int, values: FloatArray, window: Window) -> FloatArray:
-        """Replace the pixels that stand in a frame, or in a window of it, by the scene behind them."""
+        """Replace the overlay in a frame, or in a window of it, by the scene behind it."""
         part = relative_window(self.window, window)
         replaced, chosen = values.copy(), self.mask[part]
         replaced[chosen] = self.scene[self.placement.place(number)][part][chosen]
@@ -99,19 +99,19 @@ class Overlay:
 
 @dataclass(frozen=True, eq=False)
 class Title:
-    """Pixels that stand while the air bends the scene around them."""
+    """An overlay of a static camera: pixels that stay while the air bends the scene around them."""
 
     mask: NDArray[np.bool_]  # (H, W)
     frame: FloatArray  # (H, W) or (H, W, 3): mean of the frames
     window: Window  # rows and columns of the file that the mask spans
 
     def without(self, _: int, values: FloatArray, window: Window) -> FloatArray:
-        """Continue a frame, or a window of it, over the pixels that stand."""
+        """Continue the scene of a frame, or of a window of it, over the title."""
         mask = self.mask[relative_window(self.window, window)]
         return continued(values, ~mask) if mask.any() else values
 
     def put_back(self, image: FloatArray, left: int = 0, top: int = 0) -> FloatArray:
-        """Give an image, whose first pixel is at (left, top) of the frame, the pixels that stand, with a soft edge."""
+        """Put the title back, with a soft edge, into an image whose first pixel is at (left, top) of the frame."""
         window = np.s_[top : top + len(image), left : left + image.shape[1]]
         weight = np.maximum(cv2.GaussianBlur(self.mask.astype(np.float32), (0, 0), _FADE), self.mask)[window]
         weight = weight if image.ndim == 2 else weight[..., None]
@@ -140,16 +140,16 @@ def read_static_mask(path: str | os.PathLike[str], source: FrameSource) -> NDArr
 def without_overlay(
     survey: Survey, mask: NDArray[np.bool_] | None = None, moments: Moments | None = None
 ) -> tuple[Survey, NDArray[np.bool_] | None, Title | None, tuple[Decision, ...]]:
-    """Replace what stands in the frames while the scene moves; frames without it are returned as they are.
+    """Replace the static overlay of a clip; frames without one are returned as they are.
 
     Return the frames, the pixels (H, W) of the scene that no frame shows, the title that has to be put back into
-    results because the camera stands as well, and the decisions. ``mask`` (H, W) names the pixels that are replaced;
+    results because the camera is static as well, and the decisions. ``mask`` (H, W) names the pixels that are replaced;
     ``moments`` are those of the survey, if they are known.
     """
     given, title = mask is not None, None
     if mask is None and FEWEST <= len(survey.small) <= _MOST:
         moments = moments or measure_moments(survey)
-        mask, title = _standing(survey.clip, moments)
+        mask, title = _static_regions(survey.clip, moments)
         if mask is not None:
             shown = mask if title is None else title.mask
             mask, title = _with_digits(mask, title, _digits(survey.clip, moments, shown))
@@ -161,13 +161,13 @@ def without_overlay(
         if title is None:
             return survey, None, None, ()
         choice = f"{100 * float(title.mask.mean()):.1f} % of the frame kept as in the mean of the frames"
-        reason = "it stands while the air bends the scene around it; it is neither moved nor deblurred"
+        reason = "it is static while the air bends the scene around it; it is neither moved nor deblurred"
         return survey.adjusted(title.without, small), title.mask, title, (Decision("overlay", choice, reason),)
-    if moments is not None and not given and _standing(survey.clip, moments, shifts)[0] is None:
+    if moments is not None and not given and _static_regions(survey.clip, moments, shifts)[0] is None:
         return survey, None, None, ()
     overlay = _overlay(survey, mask, shifts)
     choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced by what other frames show"
-    reason = "asked for" if given else "it stands while the scene moves"
+    reason = "asked for" if given else "it is static while the scene moves"
     hidden = float(overlay.hidden.mean())
     if hidden >= _REPORTED:
         choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced"
@@ -176,10 +176,10 @@ def without_overlay(
     return survey.adjusted(overlay.without, small), overlay.hidden, None, (decision,)
 
 
-def _standing(
+def _static_regions(
     source: FrameSource, moments: Moments, shifts: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.bool_] | None, Title | None]:
-    """Find connected regions with edges that stand: for a camera that moves and, if edges move, for one that stands.
+    """Find connected regions with static edges: for a camera that moves and, if edges move, for a static one.
 
     Where ``shifts`` (T, 2) of the camera are known, what lies along its path does not count.
     """
@@ -193,7 +193,7 @@ def _standing(
     if shifts is not None:
         across = np.einsum("iyx,ij,jyx->yx", slopes, np.cov(shifts.T), slopes)
         motion = np.minimum(measured, np.sqrt(np.maximum(across, 0)) / np.maximum(gradient, 1e-6))
-    edges = still & clear & (gradient * np.minimum(_STANDS * motion, 1.0) > deviation)
+    edges = still & clear & (gradient * np.minimum(_STATIC * motion, 1.0) > deviation)
     # The camera draws a title over its noise, which no edge of the scene lacks; a coder blurs that again.
     noiseless = _NOISELESS * max(usual, _LEAST_STILL / _STILL)
     drawn = clear & (deviation < np.maximum(_DRAWN * motion * gradient, noiseless))
@@ -201,7 +201,7 @@ def _standing(
     if edges.sum() < _LEAST_EDGES * edges.size and not is_drawn:
         return None, None
     constant = deviation < _CONSTANT * max(usual, _LEAST_STILL / _STILL)
-    # A flat part of the scene does not change either; what stands has no noise of the scene, or is dark like a stop.
+    # A flat part of the scene does not change either; an overlay lacks the noise of the scene, or is dark like a stop.
     black = float(mean.min())
     dark = mean < black + _DARK * (float(np.median(mean[~still])) - black) if (~still).any() else still
     mask = _regions((still & dark) | constant | edges | drawn, edges | drawn)
@@ -216,25 +216,25 @@ def _standing(
 
 
 def _digits(source: FrameSource, moments: Moments, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mark strokes that stand from one frame to the next, and change at times; with the gaps between them."""
+    """Mark strokes that stay from one frame to the next, and change at times; with the gaps between them."""
     same, clear = max(_SAME * moments.noise, _LEAST_SAME), _DEVIATIONS * max(moments.noise, _LEAST_STILL / _STILL)
-    edges, standing = np.zeros((2, *source.shape[1:3]), np.int32)
+    edges, static = np.zeros((2, *source.shape[1:3]), np.int32)
     part, before = source.select((0, len(source), max(1, len(source) // _LOOKED_AT))), None
     for frame in part:
         grey = luminance(frame)
         if before is not None:
             edge = np.hypot(*sobel_gradient(grey)) > clear
             edges += edge
-            standing += edge & (np.abs(grey - before) < same)
+            static += edge & (np.abs(grey - before) < same)
         before = grey
-    # What stands all the time is found by its deviation.
+    # What is static all the time is found by its deviation.
     moving = (edges >= _OFTEN * (len(part) - 1)) & (moments.variance > (_STILL * same) ** 2)
     if not moving.any():
         return moving
-    share = np.where(moving, standing / np.maximum(edges, 1), 0)
-    # Where the scene hardly moves, its edges stand at times as well.
+    share = np.where(moving, static / np.maximum(edges, 1), 0)
+    # Where the scene hardly moves, its edges stay at times as well.
     usual = max(float(np.quantile(share[moving], 0.9)) / _USUAL, 1.0)
-    share[standing < _TIMES] = 0
+    share[static < _TIMES] = 0
     # A clock has a colon, a date or digits that do not change; blocks that a coder copies lie anywhere.
     digits = _large(_around(mask, len(mask) // _LINE) & (share > _REMAINS * usual))
     if usual <= _ALMOST_USUAL:
@@ -252,7 +252,7 @@ def _large(strokes: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _with_digits(
     mask: NDArray[np.bool_], title: Title | None, digits: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], Title | None]:
-    """Add digits, and a pixel around them, to what stands; a digit that a box surrounds is a hole in it."""
+    """Add digits, and a pixel around them, to an overlay; a digit that a box surrounds is a hole in it."""
     wide = _around(digits, 2)
     if title is None:
         return mask | wide, None
@@ -270,7 +270,7 @@ def _motion(deviation: NDArray[np.float64], gradient: FloatArray, noise: float) 
 
 
 def _regions(grown: NDArray[Any], marks: NDArray[np.bool_], fewest: int = 1) -> NDArray[np.bool_]:
-    """Keep the connected regions that have marks."""
+    """Keep the connected regions that have enough marks."""
     _, labels = cv2.connectedComponents(grown.astype(np.uint8), connectivity=8)
     counts = np.bincount(labels[marks], minlength=int(labels.max()) + 1)
     counts[0] = 0

@@ -66,7 +66,7 @@ def take_survey(clip: FrameSource, scratch: Path | None = None) -> Survey:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Moments over time of some frames of a clip, from which what stands in them is found."""
+    """Moments over time of some frames of a clip, from which static overlays and patterns are found."""
 
     mean: FloatArray  # (H, W) or (H, W, 3)
     variance: FloatArray  # (H, W): of the luminance

@@ -94,17 +94,18 @@ def input_errors(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def format_errors(path: Path, problem: str, remedy: str = "") -> Iterator[None]:
-    """Turn the exceptions of a library about the content of ``path`` into DataError; system errors pass.
+def format_errors(name: Path | str, problem: str, remedy: str = "") -> Iterator[None]:
+    """Turn the exceptions of a library about the content of a file into DataError; system errors are left alone.
 
-    The message says what the problem is and, after the words of the library, what to do.
+    The message names the file, or a frame of it, and says what the problem is and, after the words of the library,
+    what to do.
     """
     try:
         yield
     except (TurbrestoreError, OSError):
         raise
     except Exception as error:  # NumPy, zipfile and tifffile document no closed list of exceptions for damaged files
-        raise DataError(f"{path}: {problem} ({first_line(error)}){remedy and f'; {remedy}'}") from error
+        raise DataError(f"{name}: {problem} ({first_line(error)}){remedy and f'; {remedy}'}") from error
 
 
 def check_input(path: Path) -> os.stat_result:

@@ -89,7 +89,7 @@ def check_depth(bit_depth: int) -> int:
 
 
 def at_levels(pixels: PixelArray, levels: tuple[float, float] | None) -> PixelArray:
-    """Give intensities in floating point the numbers that 0 and 1 stand for; integers stay."""
+    """Give intensities in floating point the numbers that 0 and 1 mean; integers stay."""
     if levels is None or pixels.dtype.kind != "f":
         return pixels
     return levels[0] + pixels * np.float32(levels[1] - levels[0])

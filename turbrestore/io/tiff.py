@@ -74,7 +74,7 @@ def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
             f"tiff/{dtype}",
             (len(planes), page.imagelength, page.imagewidth, *((3,) if len(planes[0]) == 3 else channels)),
             dtype,
-            lambda chosen: _frames(path, [planes[number] for number in chosen], limits),
+            lambda chosen: _frames(path, [(number, planes[number]) for number in chosen], limits),
             notes,
             limits,
         )
@@ -99,7 +99,7 @@ def read_tiff(path: Path, data: bytes, limits: Limits) -> tuple[PixelArray | Non
         known = _channels(page) is not None and page.bitspersample in (8, 16, 32, 64)
         if known or page.compression not in _JPEG:
             # Decode as a check: OpenCV would fill missing pixels.
-            pixels = _page_pixels(path, page, limits)
+            pixels = _page_pixels(str(path), page, limits)
         return (upright(pixels, page.tags.valueof(ORIENTATION_TAG)), _notes(page)) if known else (None, ())
 
 
@@ -127,7 +127,7 @@ def _list_pages(path: Path, tiff: tifffile.TiffFile, limits: Limits) -> tuple[in
         limits.check_count(len(seen), str(path))
         if not page.aspage().is_reduced:
             whole.append(number)
-    # tifffile passes over a link that leads to no page.
+    # tifffile ignores a link that leads to no page.
     tiff.filehandle.seek(tiff.pages.next_page_offset or 0)
     if tiff.filehandle.read(tiff.tiff.offsetsize) != bytes(tiff.tiff.offsetsize):
         raise DataError(f"{path}: cut short after {len(seen)} whole pages; copy the file again")
@@ -190,34 +190,33 @@ def _packed_stack(path: Path, tiff: tifffile.TiffFile) -> NDArray[Any] | None:
     return np.moveaxis(array, 1, -1) if series.axes in ("TCYX", "ZCYX") and series.shape[1] == 3 else array
 
 
-def _frames(path: Path, chosen: Sequence[tuple[int, ...]], limits: Limits) -> Iterator[PixelArray]:
+def _frames(path: Path, chosen: Iterable[tuple[int, Sequence[int]]], limits: Limits) -> Iterator[PixelArray]:
+    """Read frames, of which the number and the numbers of the pages are given."""
     import tifffile
 
     with input_errors(path), format_errors(path, _NOT_TIFF), tifffile.TiffFile(path, **_ALONE) as tiff:
-        for numbers in chosen:
+        for frame, pages in chosen:
             planes = []
-            for number in numbers:
+            for number in pages:
                 page = tiff.pages[number].aspage()
                 _check_page(path, page, limits)
                 if _channels(page) is None:
                     raise DataError(f"{path}: page {number}: expected grey or RGB; convert the file")
-                planes.append(_page_pixels(path, page, limits))
+                planes.append(_page_pixels(f"{path}: frame {frame}", page, limits))
             yield planes[0] if len(planes) == 1 else np.stack(planes, axis=-1)
 
 
-def _page_pixels(path: Path, page: tifffile.TiffPage, limits: Limits) -> PixelArray:
-    """Pixels of a page, grey or RGB, with white as the highest value."""
-    parts = [part for part in zip(page.dataoffsets, page.databytecounts, strict=True) if part[1] > 0]
+def _page_pixels(name: str, page: tifffile.TiffPage, limits: Limits) -> PixelArray:
+    """Pixels of a page, grey or RGB, with white as the highest value; ``name`` is the file, or a frame of it."""
     if page.compression not in (*_BOUNDED, *_IMAGES):
-        name = getattr(page.compression, "name", page.compression)
-        problem = f"expected a compression such as deflate, LZW or JPEG, found {name}"
-        raise DataError(f"{path}: {problem}; convert the file to one of these")
-    if page.compression != _UNCOMPRESSED and len(parts) < math.prod(page.chunked):
-        raise DataError(f"{path}: expected {math.prod(page.chunked)} parts, found {len(parts)}; copy the file again")
-    problem = _NOT_TIFF if page.compression == _UNCOMPRESSED else "compressed pixels are damaged"
-    with format_errors(path, problem, "copy the file again"):
+        compression = getattr(page.compression, "name", page.compression)
+        problem = f"expected a compression such as deflate, LZW or JPEG, found {compression}"
+        raise DataError(f"{name}: {problem}; convert the file to one of these")
+    parts = _parts(name, page)
+    problem = "pixels are damaged" if page.compression == _UNCOMPRESSED else "compressed pixels are damaged"
+    with format_errors(name, problem, "copy the file again"):
         if page.compression in _IMAGES:
-            _check_images(path, page, parts, limits)
+            _check_images(name, page, parts, limits)
         # Its threads would be beside those of the caller.
         pixels = page.asarray(maxworkers=1)
     if pixels.ndim == 3:
@@ -227,7 +226,18 @@ def _page_pixels(path: Path, page: tifffile.TiffPage, limits: Limits) -> PixelAr
     return np.iinfo(pixels.dtype).max - pixels if page.photometric == _WHITE_IS_ZERO else pixels
 
 
-def _check_images(path: Path, page: tifffile.TiffPage, parts: Sequence[tuple[int, int]], limits: Limits) -> None:
+def _parts(name: str, page: tifffile.TiffPage) -> list[tuple[int, int]]:
+    """Offset and size of every strip or tile of a page; tifffile would make those up that have no bytes in the file."""
+    parts, end = list(zip(page.dataoffsets, page.databytecounts, strict=True)), page.parent.filehandle.size
+    expected = math.prod(page.chunked)
+    missing = expected - sum(0 < offset < end and size > 0 for offset, size in parts[:expected])
+    if missing:
+        problem = f"expected pixels in all strips and tiles, found none in {missing} of {expected}"
+        raise DataError(f"{name}: {problem}; copy the file again")
+    return parts
+
+
+def _check_images(name: str, page: tifffile.TiffPage, parts: Sequence[tuple[int, int]], limits: Limits) -> None:
     """Refuse parts that are images of more pixels than are read, or JPEG images that are cut short."""
     import PIL.Image
 
@@ -236,9 +246,9 @@ def _check_images(path: Path, page: tifffile.TiffPage, parts: Sequence[tuple[int
         data = io.BytesIO(page.parent.filehandle.read(size))
         # The decoder would make up the pixels that are missing.
         if page.compression in _JPEG and not data.getvalue().rstrip(b"\0").endswith(_JPEG_END):
-            raise DataError(f"{path}: compressed pixels are damaged (cut short); copy the file again")
+            raise DataError(f"{name}: compressed pixels are damaged (cut short); copy the file again")
         with warnings.catch_warnings():
             # Pillow warns of sizes that the limits may allow.
             warnings.simplefilter("ignore")
             with PIL.Image.open(data, formats=("JPEG", "JPEG2000", "PNG", "WEBP")) as image:
-                limits.check_size(*image.size, f"{path}: a part")
+                limits.check_size(*image.size, f"{name}: a part")

@@ -14,16 +14,16 @@ all the same; in flat regions dense inverse search matches noise with noise, ove
 Given W̄ and τ, the posterior mean is ``Ŵ = (J + ε)⁻¹ (J W + ε W̄)``, ``ε = m σ² / (A τ²) + κ tr(J) / 2``, where J and
 J W are averages over the window.  W̄ is the same estimate in a window twice as wide, and so on until the window is the
 image, for which it is zero: this is normalised convolution (Knutsson and Westin 1993) with tensors and growing windows.
-A grows fourfold from window to window, so ε is a quarter: what no small window tells in noise, a large one does.
+A grows fourfold from window to window, so ε falls to a quarter: in noise, wide windows show what narrow ones do not.
 Texture keeps its flow, an edge takes the component along it from its neighbourhood, and a flat region takes both.
 
 Two things keep the estimate from trusting the measurement too much.  A flow method errs by more than noise explains,
-by a factor m in variance, and the part of its error that is none of noise does not average out, so ε falls with A only
-to that of a noise of 0.01.  And the direction of an edge is known to a few degrees only: without κ, changes of the
-tensor's direction from one pixel to the next would pass for a measurement along the edge.  Results lie within the range
-of the measured flow.
+by a factor m in variance, and the part of its error that noise does not cause does not average out, so ε falls with A
+only to its value for a noise of 0.01.  And the direction of an edge is known to a few degrees only: without κ, changes
+of the tensor's direction from one pixel to the next would count as a measurement along the edge.  Results lie within
+the range of the measured flow.
 
-J also contains the noise of the reference, which must not pass for texture, so its eigenvalues are lowered by it.
+J also contains the noise of the reference, which must not count as texture, so its eigenvalues are lowered by it.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _AREA = 4 * np.pi * _TENSOR_WINDOW**2
 # Variance of a derivative, in that window, of white noise of unit variance; noise rarely exceeds three times that.
 _GRADIENT_NOISE = 1 / (8 * np.pi * _GRADIENT_WINDOW**4)
 _NOISE_MARGIN = 3.0
-# The same without margin: Scharr's derivative sees less of the finest noise than a derivative proper.
+# The same for Scharr's derivative, which damps the finest noise, without margin.
 _SCHARR_NOISE = 0.0214
 # τ, pixels; m and κ.
 _DEVIATION = 0.5
@@ -60,7 +60,7 @@ Tensors = tuple[FloatArray, ...]
 
 
 def flow_confidence(reference: ArrayLike) -> Tensors:
-    """Structure tensors of the reference (H, W[, 3]), then those of ever twice as wide windows and grids."""
+    """Structure tensors of the reference (H, W[, 3]), then those of windows and grids twice as coarse each time."""
     image = check_grey(reference, "reference")
     dx, dy = _gradient(image)
     xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _TENSOR_WINDOW).ravel() for product in (dx * dx, dx * dy, dy * dy))

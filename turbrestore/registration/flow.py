@@ -89,8 +89,7 @@ class FlowParams:
 
     def __post_init__(self) -> None:
         require(
-            self.method in FLOW_METHODS,
-            f"method: expected one of {', '.join(FLOW_METHODS)}, found {self.method!r}",
+            self.method in FLOW_METHODS, f"method: expected one of {', '.join(FLOW_METHODS)}, found {self.method!r}"
         )
         require_between("contrast_window", self.contrast_window, 0, 1000, "pixels")
         require_between("contrast_floor", self.contrast_floor, 1e-6, 1)
@@ -101,7 +100,7 @@ class FlowFrame:
     """A frame and everything that is computed from it once, whatever reference it is compared with."""
 
     image: FloatArray  # (H, W) or (H, W, 3)
-    levels: GreyImage  # (H, W): the contrast-normalised image that the solvers see
+    normalised: GreyImage  # (H, W): the frame with its local contrast normalised, which the solvers see
     noise: float  # standard deviation of the noise, intensity
     noisy: bool = False  # whether the solvers see this frame and the reference smoothed
     # (H, W, 2) or on a coarser grid, or None; flow to this frame from a similar reference, pixels, from which the
@@ -122,10 +121,7 @@ class FlowReference:
 
 
 def estimate_flow(
-    reference: ArrayLike,
-    frames: ArrayLike,
-    params: FlowParams | None = None,
-    runtime: Runtime = DEFAULT,
+    reference: ArrayLike, frames: ArrayLike, params: FlowParams | None = None, runtime: Runtime = DEFAULT
 ) -> FloatArray:
     """Measure the flow from ``reference`` to each of ``frames``.
 
@@ -170,10 +166,7 @@ def estimate_flow(
 
 
 def iterate_flows(
-    reference: ArrayLike,
-    frames: Iterable[ArrayLike],
-    params: FlowParams | None = None,
-    runtime: Runtime = DEFAULT,
+    reference: ArrayLike, frames: Iterable[ArrayLike], params: FlowParams | None = None, runtime: Runtime = DEFAULT
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Yield frames (H, W[, 3]) and flows (H, W, 2) in order while threads solve a few frames ahead.
 
@@ -205,9 +198,7 @@ def measure_flows(
 
 
 def prepare_reference(
-    reference: ArrayLike,
-    params: FlowParams | None = None,
-    runtime: Runtime = DEFAULT,
+    reference: ArrayLike, params: FlowParams | None = None, runtime: Runtime = DEFAULT
 ) -> FlowReference:
     """Prepare the image (H, W[, 3]) that flows start from."""
     params = params or FlowParams()
@@ -223,8 +214,8 @@ def prepare_reference(
     device = find_device(runtime.device) if params.method == "tvl1" else CPU
 
     def prepared(noisy: bool) -> tuple[GreyImage, FlowSolver]:
-        levels = grey_levels(target, *contrast, _SMOOTHING * noisy)
-        return levels, FLOW_METHODS[params.method](params, levels, device)
+        normalised = normalise_to_8_bits(target, *contrast, _SMOOTHING * noisy)
+        return normalised, FLOW_METHODS[params.method](params, normalised, device)
 
     solvers = {noisy: prepared(noisy) for noisy in (False, True)}
 
@@ -233,17 +224,17 @@ def prepare_reference(
             raise DataError(f"frames: expected {shape} pixels, found {image.shape[:2]}")
         noise = estimate_noise(image)
         noisy = noise_share(image, noise) > _NOISY
-        return FlowFrame(image, grey_levels(image, *contrast, _SMOOTHING * noisy), noise, noisy)
+        return FlowFrame(image, normalise_to_8_bits(image, *contrast, _SMOOTHING * noisy), noise, noisy)
 
     def solve(batch: list[FlowFrame]) -> list[FloatArray]:
         alike = groupby(batch, lambda frame: (frame.noisy, frame.draft))
         return [flow for kind, frames in alike for flow in solve_alike(*kind, list(frames))]
 
     def solve_alike(noisy: bool, draft: bool, batch: list[FlowFrame]) -> list[FloatArray]:
-        levels, solver = solvers[noisy]
+        normalised, solver = solvers[noisy]
         # Farneback's method takes no start.
         usable = [replace(frame, start=None) for frame in batch] if params.method == "farneback" else batch
-        placed, starts, shifts = zip(*(_place(frame, levels, position) for frame in usable), strict=True)
+        placed, starts, shifts = zip(*(_place(frame, normalised, position) for frame in usable), strict=True)
         flows = list(solver(np.stack(placed), list(starts), draft))
         if confidence is not None:
             flows = [regularise_flow(f, confidence, frame.noise) for f, frame in zip(flows, batch, strict=True)]
@@ -265,8 +256,8 @@ def normalise_contrast(image: ArrayLike, window: float, floor: float = 0.01) -> 
     return centred
 
 
-def grey_levels(image: FloatArray, window: float, floor: float, smoothing: float = 0.0) -> NDArray[np.uint8]:
-    """Contrast-normalised image (H, W) in 8 bits, with 32 levels for each local standard deviation."""
+def normalise_to_8_bits(image: FloatArray, window: float, floor: float, smoothing: float = 0.0) -> NDArray[np.uint8]:
+    """Image (H, W) of normalised local contrast in 8 bits, with 32 grey levels for each local standard deviation."""
     if smoothing > 0:
         image = cv2.GaussianBlur(luminance(image), (0, 0), smoothing)
     if window > 0:
@@ -283,16 +274,16 @@ def _place(
 ) -> tuple[GreyImage, FloatArray | None, FloatArray]:
     """Move a frame onto the grid of the reference by whole pixels; ``outside`` supplies what the frame does not show.
 
-    Returns its levels (H, W), its start (H, W, 2) from there, and the shift (2,).
+    Returns its normalised image (H, W), its start (H, W, 2) from there, and the shift (2,).
     """
     start = None
     if frame.start is not None:
-        size = frame.levels.shape[::-1]
+        size = frame.normalised.shape[::-1]
         start = cv2.resize(frame.start.astype(np.float32, copy=False), size, interpolation=cv2.INTER_LINEAR)
     shift = np.zeros(2, np.float32) if position is None else frame_shift(frame.image, start, position)
     if not shift.any():
-        return frame.levels, start, shift
-    return shift_frame(frame.levels, shift, outside), None if start is None else start - shift, shift
+        return frame.normalised, start, shift
+    return shift_frame(frame.normalised, shift, outside), None if start is None else start - shift, shift
 
 
 FLOW_METHODS: dict[str, Callable[[FlowParams, GreyImage, str], FlowSolver]] = {

@@ -20,8 +20,8 @@ from ..core.arrays import FloatArray
 from ..core.errors import require, require_between
 
 GreyImage = NDArray[np.uint8]
-# From frames (B, H, W), the flow that each starts from, or None, and whether drafts will do, to flows (B, H, W, 2).
-# Threads share a solver.
+# Takes frames (B, H, W), the flow that each starts from, or None, and whether drafts will do; returns flows
+# (B, H, W, 2).  Threads share a solver.
 FlowSolver = Callable[[GreyImage, list[FloatArray | None], bool], FloatArray]
 # Pixels by which the patches of a flow with a start lie further apart.
 _WIDER_STRIDE = 2
@@ -94,8 +94,8 @@ class FarnebackParams:
 def dis_solver(params: DisParams, reference: GreyImage, start_level: int | None = None) -> FlowSolver:
     """Prepare dense inverse search from a reference.
 
-    A start that is only a guess is searched for from a coarser level, ``start_level`` above the finest, as thoroughly
-    as without a start.  ``reference`` (H, W).
+    With ``start_level`` a start is only a guess: the search begins that many levels above the finest, and is as
+    thorough as without a start.  ``reference`` (H, W).
     """
 
     def solve(frame: GreyImage, start: FloatArray | None, draft: bool) -> FloatArray:

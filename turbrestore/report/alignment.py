@@ -41,7 +41,7 @@ def align_curves(figure: Figure) -> None:
         hspace=_TITLED / each,
     )
     for axes in figure.axes:
-        # Axes of equal scale would stand in the middle.
+        # Axes of equal scale would be narrow and in the middle.
         axes.set_anchor("SW")
         axes.yaxis.set_label_coords((_LABEL - _LEFT) / (WIDTH - _LEFT - _RIGHT), 0.5)
 

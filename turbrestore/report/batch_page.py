@@ -36,7 +36,7 @@ class ClipRow:
     # Pictures of a frame and of the result, as data URIs.
     before: str = ""
     after: str = ""
-    key: str = ""  # stands for input and settings; a clip with another key has to be restored again
+    key: str = ""  # identifies input and settings; a clip with another key has to be restored again
 
 
 def thumbnail_uri(image: FloatArray) -> str:

@@ -66,7 +66,7 @@ class Lap:
 
 
 def headline(restoration: Restoration) -> list[Fact]:
-    """Return the key figures, which stand at the top of the page."""
+    """Return the key figures at the top of the page."""
     facts = [
         Fact("Frames", str(restoration.frame_count), f"{restoration.train} of them for training"),
         Fact("Motion", f"{restoration.motion:.2f} px", "root mean square"),

@@ -34,7 +34,7 @@ class Panel:
     title: str
     svg: Markup  # the ``<svg>`` element
     caption: str  # what the plot shows, and what to look for
-    is_map: bool  # whether it has the shape of the image; maps stand before the curves
+    is_map: bool  # whether it has the shape of the image; maps come before the curves
 
 
 def make_panel(figure: Figure, name: str, description: str, caption: str) -> Panel:

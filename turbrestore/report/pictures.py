@@ -31,13 +31,7 @@ _NARROW, _DARK, _CLIPPED, _MARGIN = 0.2, 0.5, 0.2, 0.1
 # What the switch of the page does: it clips this percentage of the pixels at either end. Where the median of what is
 # not black is dim, as in a night scene with lamps, shadows are lifted until it is brighter, by at least this exponent.
 _STRETCHED, _BLACK, _DIM, _BRIGHTER, _LEAST_EXPONENT = 0.5, 0.05, 0.15, 0.3, 0.45
-_TITLES = {
-    "frame": "Frame",
-    "mean": "Mean",
-    "centroid": "Centroid",
-    "filtered": "Filtered",
-    "result": "Result",
-}
+_TITLES = {"frame": "Frame", "mean": "Mean", "centroid": "Centroid", "filtered": "Filtered", "result": "Result"}
 
 
 @dataclass(frozen=True)

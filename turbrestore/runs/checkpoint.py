@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import DataError
+from ..filtering.estimates import Gaussian, PixelGaussian
 from ..filtering.filter_records import FilterCheckpoint, FilterState, FrameRecord
-from ..filtering.kalman import Gaussian, PixelGaussian
 from ..io.npy import read_npz
 from ..io.output import atomic_output
 

@@ -59,9 +59,7 @@ class RunRecord:
 
 
 def describe_run(
-    source: FrameSource,
-    settings: RestoreParams | Mapping[str, Any] | None = None,
-    command: tuple[str, ...] = (),
+    source: FrameSource, settings: RestoreParams | Mapping[str, Any] | None = None, command: tuple[str, ...] = ()
 ) -> RunRecord:
     """Record what a restoration is made from; reads one frame.
 

@@ -3,7 +3,7 @@
 The types of numbers, flags and texts are those of the record that the file becomes.  A number that is not listed lies
 between 0 and a billion.  Infinite values are allowed where a bound is infinite.
 
-Shapes name their axes; one name stands for one length within a stage file:
+Shapes name their axes; one name is one length within a stage file:
 
 ======  =========================================================
 H, W    height and width, pixels
@@ -62,11 +62,7 @@ class NumberSpec:
 
 _IMAGE = ArraySpec("f4", "H W|H W 3")
 FIELDS: dict[str, dict[str, ArraySpec | NumberSpec]] = {
-    "centroid": {
-        "image": _IMAGE,
-        "flows": ArraySpec("f4", "T H W 2"),
-        "mean_flow_sizes": ArraySpec("f8", "i", low=0),
-    },
+    "centroid": {"image": _IMAGE, "flows": ArraySpec("f4", "T H W 2"), "mean_flow_sizes": ArraySpec("f8", "i", low=0)},
     "dynamics": {
         "mean_flow": ArraySpec("f4", "H W 2"),
         "A": ArraySpec("f8", "n n"),

@@ -57,8 +57,7 @@ class Runtime:
         require(self.threads >= 0, f"threads: expected 0 or more, found {self.threads}")
         check_device(self.device)
         require(
-            self.tile is None or self.tile >= 4 * HALO,
-            f"tile: expected at least {4 * HALO} pixels, found {self.tile}",
+            self.tile is None or self.tile >= 4 * HALO, f"tile: expected at least {4 * HALO} pixels, found {self.tile}"
         )
         if self.memory_limit is not None:
             # A number or text is as good where settings are written in Python.

@@ -18,7 +18,7 @@ F starts from A.  With ``q' = q ∘ (id + F)``, d minimises ``Σ ρ (q' + ∇q' 
 and β that fit its own window best (as in Lucas and Kanade 1981, whose windows share one), and ρ is the squared
 correlation there over the spread of q'.  The windows of α and β are hardly wider than an edge, so that edges side by
 side may change their contrast by different factors.  Those of d are wide, because what remains between two results is
-the mean displacement by air, which is smooth; where one has little gradient, a wider one stands in.
+the mean displacement by air, which is smooth; where one has little gradient, a wider one takes its place.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ n : frames that are kept, of T
 
 The mean of n registered frames has the mean amplitude of their detail and the noise ``z / √n``.  So sharpness gains
 ``ā(n) / ā(T)`` and noise costs ``√(T / n)``.  The suggested share has the largest ``ā(n) / √(z² / n + f²)``: there
-detail stands highest above noise and error.  Frames that barely differ are all worth keeping, and a few that the air
+detail exceeds noise and error most.  Frames that barely differ are all worth keeping, and a few that the air
 has spared are worth more than the rest only where noise is low.
 """
 
@@ -92,7 +92,7 @@ def quality_table(found: QualityList, numbers: Iterable[int]) -> str:
     lines = ["share kept   frames   noise   sharpness"]
     rows = [*((f"{one.share:.0%}", one) for one in found.kept), (f"{found.suggested.share:.0%} *", found.suggested)]
     lines += [f"{name:<10} {one.frames:>8} {one.noise:>6.2f}× {one.sharpness:>10.2f}×" for name, one in rows]
-    lines += ["* suggested: there detail stands highest above noise; restore weighs frames by itself", ""]
+    lines += ["* suggested: there detail exceeds noise most; restore weighs frames by itself", ""]
     top = float(found.quality.max()) or 1.0
     order = found.order
     places: list[int | None] = list(range(len(order)))

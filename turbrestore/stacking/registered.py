@@ -62,10 +62,7 @@ class RegisteredFrame:
 
 
 def registered_frames(
-    source: FrameSource,
-    restoration: Restoration,
-    params: RestoreParams | None = None,
-    runtime: Runtime = DEFAULT,
+    source: FrameSource, restoration: Restoration, params: RestoreParams | None = None, runtime: Runtime = DEFAULT
 ) -> Iterator[RegisteredFrame]:
     """Yield the frames of a clip in the geometry of its restored image.
 

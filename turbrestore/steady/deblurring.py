@@ -7,7 +7,7 @@ n : number of frames that the memory holds, for every pixel (:mod:`turbrestore.s
 
 ``u = λ B (λ B² + L)⁻¹ f`` is the minimum of ``λ/2 ‖Bu − f‖² + ½ ‖∇u‖²`` (see
 :mod:`turbrestore.deconvolution.conjugate_gradient`); the image is continued by reflection.  The filter is linear and
-the same for every frame, so it adds no flicker.  λ follows the contrast and the noise; a floor of the noise stands for
+the same for every frame, so it adds no flicker.  λ follows the contrast and the noise; a floor of the noise represents
 what noise does not explain, registration that differs from frame to frame and video compression.
 
 What is remembered has averaged that out: there a second filter has a lower floor and its own width, and the result is

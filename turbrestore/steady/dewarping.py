@@ -15,7 +15,7 @@ V : its inverse map, ``(id + D) ∘ (id + V) = id``, about d_k
 
 Exposure and white balance may hunt.  Neighbours get the light of the frame before they are averaged with it, and the
 result gets the mean light of the pairs of neighbours, as far as light changes by the few per cent by which cameras
-hunt; what is switched on passes at once.
+hunt; what is switched on shows at once.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ from .displacement import (
 from .fusion import fuse
 from .grid import enlarged, follow, grid_of, inverted, pixel_of
 from .settings import SteadyParams
-from .windows import Window, WindowFrame, contrast_levels, light_between, relit
+from .windows import Window, WindowFrame, light_between, normalised_image, relit
 
 # Patches this sparse lose nothing on phase screens; closer ones take a fifth longer.
 _FLOW = DisParams(finest_scale=0, patch_size=8, patch_stride=4, refinements=5, smoothness=10.0)
 # Level of the pyramid, above the finest, at which a search with a start begins.
 _START_LEVEL = 1
-# Largest change of the light in a window, logarithm, of which half passes: cameras hunt by less, and lamps change more.
+# Change of the light in a window, logarithm, of which half is taken out: cameras hunt by less, and lamps change more.
 _HUNTING = 0.25
 
 
@@ -141,11 +141,11 @@ def measure_flow(reference: FloatArray, image: FloatArray, start: FloatArray) ->
 
     ``reference, image`` (H, W) or (H, W, 3); ``start`` (h, w, 2); returns (h, w, 2).
     """
-    return _solver(contrast_levels(reference), reference.shape)(contrast_levels(image), start)
+    return _solver(normalised_image(reference), reference.shape)(normalised_image(image), start)
 
 
-def _solver(levels: GreyImage, shape: tuple[int, ...]) -> Callable[[GreyImage, FloatArray], FloatArray]:
-    solve, pixel = dis_solver(_FLOW, levels, _START_LEVEL), np.float32(pixel_of(shape))
+def _solver(normalised: GreyImage, shape: tuple[int, ...]) -> Callable[[GreyImage, FloatArray], FloatArray]:
+    solve, pixel = dis_solver(_FLOW, normalised, _START_LEVEL), np.float32(pixel_of(shape))
     return lambda other, start: pixel * solve(other[None], [start / pixel], False)[0]
 
 
@@ -155,11 +155,11 @@ def _measure(window: Window) -> tuple[dict[int, FloatArray], dict[int, Matrix]]:
     A pan leads far in a dozen frames, so the search for a far neighbour starts where the camera would be if it went on
     as it went to the one before.
     """
-    levels, shape = window.frame.levels, window.frame.image.shape
+    normalised, shape = window.frame.normalised, window.frame.image.shape
     if min(shape[:2]) < MIN_SIDE:
         found = f"{shape[1]}×{shape[0]}"
         raise DataError(f"frames: expected at least {MIN_SIDE}×{MIN_SIDE} pixels for optical flow, found {found}")
-    solve = _solver(levels, shape)
+    solve = _solver(normalised, shape)
     flows: dict[int, FloatArray] = {}
     cameras: dict[int, Matrix] = {}
     for offset in sorted(window.neighbours, key=abs):
@@ -168,7 +168,7 @@ def _measure(window: Window) -> tuple[dict[int, FloatArray], dict[int, Matrix]]:
             expected = expected_motion(cameras, offset)
         else:
             expected = _first_guess(window.frame, neighbour)
-        flows[offset] = solve(neighbour.levels, camera_flow(expected, shape, levels.shape))
+        flows[offset] = solve(neighbour.normalised, camera_flow(expected, shape, normalised.shape))
         cameras[offset] = fit_camera(flows[offset], shape)
     return flows, cameras
 

@@ -16,10 +16,10 @@ with a the acceleration of the point.  Over several i the displacements of the n
     D = Σ w_i S_i / (½ + Σ w_i) ≈ −d_k,      w_i = 1 / (1 + (|S_i|² / c²)²)
 
 with |S_i|² averaged in a small window.  A large S_i is motion rather than turbulence: it has little weight, and where
-all are large the frame passes as it is.  Without a neighbour on the other side motion does not cancel, so such an S_i
+all are large the frame stays as it is.  Without a neighbour on the other side motion does not cancel, so such an S_i
 counts less where something moves.  The ½ is the share of the frame itself, whose flow to itself is zero.
 
-Curved motion and turbulence cannot be told apart in a few frames.  While the camera stands still, most of a scene does,
+Curved motion and turbulence cannot be told apart in a few frames.  While the camera is static, so is most of a scene,
 and c follows the median of |S_i| between 1 and 4 pixels; while it moves, c is 1 pixel.
 
 What moves
@@ -47,7 +47,7 @@ from .camera_path.camera import Matrix, camera_flow, camera_size
 
 # Window in which |S|² is averaged, pixels; share of the frame itself.
 _WINDOW, _OWN_SHARE = 4.0, 0.5
-# c over the median of |S_i| while the camera stands still; smallest and largest c, pixels.
+# c over the median of |S_i| while the camera is static; smallest and largest c, pixels.
 _SIZES, _LEAST, _MOST = 2.5, 1.0, 4.0
 # Distance of the camera from motion at constant velocity, pixels, at which it counts as half shaking.
 _SHAKE = 2.0
@@ -69,14 +69,14 @@ def mean_displacement(flows: Mapping[int, FloatArray], largest: float, path: Flo
     ``flows`` (h, w, 2) on a grid whose pixel is so many of the image wide; ``path`` (h, w) of :func:`path_length`;
     returns (h, w, 2).
     """
-    stands = 1 / (1 + (path / (_PATH * largest)) ** 4)
+    static = 1 / (1 + (path / (_PATH * largest)) ** 4)
     total, weights = 0.0, _OWN_SHARE
     for offset in sorted({abs(offset) for offset in flows}):
         mean = _symmetric(flows, offset)
         size = cv2.GaussianBlur(np.einsum("yxc,yxc->yx", mean, mean), (0, 0), _WINDOW / pixel)
         weight = (1 / (1 + (size / largest**2) ** 2))[..., None]
         if offset not in flows or -offset not in flows:
-            weight *= stands[..., None]
+            weight *= static[..., None]
         total, weights = total + weight * mean, weights + weight
     return np.asarray(total / weights, np.float32)
 

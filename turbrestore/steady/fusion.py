@@ -9,10 +9,10 @@ t : difference that misregistration and noise explain, intensity, ``t² = m² |�
 w : weight of a neighbour, ``exp(−e / 2t²)``
 
 Where a neighbour shows something else than the frame, because an object or the background it uncovers has moved, or
-the flow is wrong, e exceeds what t allows and the neighbour has no weight: the frame passes as it is, and nothing of
+the flow is wrong, e exceeds what t allows and the neighbour has no weight: the frame stays as it is, and nothing of
 the neighbour is left as a ghost.  Weights are as smooth as the windows, so they are computed on the grid of the image.
 
-The result is checked against the frame, before it is deblurred: where it is worse, the frame passes less changed.
+The result is checked against the frame, before it is deblurred: where it is worse, the frame is changed less.
 
 Symbols of the check
 --------------------

@@ -1,4 +1,4 @@
-"""Memory of what stands still: a recursive estimate of the scene, as long as it agrees with the frames.
+"""Memory of what is static: a recursive estimate of the scene, as long as it agrees with the frames.
 
 Symbols
 -------
@@ -20,7 +20,7 @@ from ``N E⁻¹``, where the path of the camera expects F.
 
 Z is a Kalman filter of one value for every pixel, whose image drift a pixel earns: where the innovation
 ``F ∘ (id + R) − Z`` is explained by misregistration and noise (w = 1), n grows and the frame has a weight of 1/n; where
-it is not, the variance is opened, n falls to 1, and the frame passes::
+it is not, the variance is opened, n falls to 1, and the frame takes its place::
 
     n ← 1 + w min(n, s (1 − g) / (1 − s (1 − g))),      Z ← Z + (F ∘ (id + R) − Z) / n
 

@@ -29,8 +29,8 @@ class SteadyParams:
         Give every frame before more than two others have been read: neighbours after a frame are at most two frames
         away, and no blur is removed until it has been estimated.
     largest : float, optional
-        What turbulence displaces at most, pixels; larger displacements pass for motion and are kept.  By default it is
-        measured while the camera stands still or is locked, and 1 while it moves.
+        What turbulence displaces at most, pixels; larger ones count as motion and are kept.  By default it is
+        measured while the camera is static or locked, and 1 while it moves.
 
     Raises
     ------

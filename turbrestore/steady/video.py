@@ -2,7 +2,7 @@
 
 1. A frame is freed of its turbulent displacement, and fused with its neighbours
    (:mod:`turbrestore.steady.dewarping`), as soon as the last of them is there.
-2. Where the scene stands still it is fused with the memory of all frames before (:mod:`turbrestore.steady.memory`).
+2. Where the scene is static it is fused with the memory of all frames before (:mod:`turbrestore.steady.memory`).
 3. One blur, estimated from an early frame of the clip, is removed from every frame by linear filters
    (:mod:`turbrestore.steady.deblurring`); from what is remembered, one that is estimated there.
 

@@ -19,7 +19,7 @@ from ..core.arrays import FloatArray, check_image, luminance
 from ..core.errors import DataError
 from ..footage.checks.scene_cuts import similarity_at, thumbnail
 from ..registration.camera.global_shift import ShiftReference, prepare_shift_reference
-from ..registration.flow import grey_levels
+from ..registration.flow import normalise_to_8_bits
 from ..registration.opencv_flow import GreyImage
 from ..runtime.image_stacks import spline_planes
 from .grid import pixel_of, reduced
@@ -45,7 +45,7 @@ class WindowFrame:
     image: FloatArray  # (H, W) or (H, W, 3)
     planes: FloatArray  # (C, H + 3, W + 3): splines through its channels, which are sampled for each of its neighbours
     grey: FloatArray  # (h, w): luminance on the grid of the image
-    levels: GreyImage  # (h, w): contrast-normalised image, which flow is measured from
+    normalised: GreyImage  # (h, w): luminance of normalised local contrast, which flow is measured from
     coarse: FloatArray  # (h', w') or (h', w', 3): means of squares, which light is measured from
     scene: int  # number of the scene, from 0
     shift_reference: ShiftReference  # what shifts of the whole image are measured against
@@ -85,12 +85,12 @@ def iter_windows(
         yield _window(kept, first, number, offsets)
 
 
-def contrast_levels(image: FloatArray) -> GreyImage:
-    """Contrast-normalised image on its grid, which flow is measured from.
+def normalised_image(image: FloatArray) -> GreyImage:
+    """Normalise the local contrast of an image on its grid, from which flow is measured.
 
     ``image`` (H, W) or (H, W, 3); returns (h, w).
     """
-    return _levels(luminance(reduced(image)), image.shape)
+    return _normalised(luminance(reduced(image)), image.shape)
 
 
 def coarse_image(image: FloatArray) -> FloatArray:
@@ -132,8 +132,8 @@ def relit(image: FloatArray, gain: FloatArray) -> FloatArray:
     return image * factor / (1 + (factor - 1) * np.clip(image, 0, 1) ** _WHITE)
 
 
-def _levels(grey: FloatArray, shape: tuple[int, ...]) -> GreyImage:
-    return grey_levels(grey, _CONTRAST_WINDOW / pixel_of(shape), _CONTRAST_FLOOR)
+def _normalised(grey: FloatArray, shape: tuple[int, ...]) -> GreyImage:
+    return normalise_to_8_bits(grey, _CONTRAST_WINDOW / pixel_of(shape), _CONTRAST_FLOOR)
 
 
 def _window(kept: deque[WindowFrame], first: int, number: int, offsets: Sequence[int]) -> Window:
@@ -160,6 +160,6 @@ def _prepared(frames: Iterable[ArrayLike]) -> Iterator[WindowFrame]:
             scene += similarity_at(detail, before)[0] < _CUT
         before = detail
         grey = luminance(reduced(image))
-        levels = _levels(grey, image.shape)
+        normalised = _normalised(grey, image.shape)
         shift_reference = prepare_shift_reference(image)
-        yield WindowFrame(image, spline_planes(image), grey, levels, coarse_image(image), scene, shift_reference)
+        yield WindowFrame(image, spline_planes(image), grey, normalised, coarse_image(image), scene, shift_reference)

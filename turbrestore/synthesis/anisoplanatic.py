@@ -83,7 +83,7 @@ def phase_screen_frames(
     runtime : Runtime, optional
         ``threads`` frames are computed side by side; their number does not change the frames.
     objects : sequence of MovingObject
-        Objects in front of the scene, behind the air; they stand still during an exposure.
+        Objects in front of the scene, behind the air; they do not move during an exposure.
         :func:`turbrestore.synthesis.moving_objects.with_objects` has the truth of a frame.
 
     Returns

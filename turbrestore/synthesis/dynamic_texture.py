@@ -86,8 +86,7 @@ class DynamicTextureParams:
         )
         require(self.fit in FITS, f"fit: expected one of {', '.join(FITS)}, found {self.fit!r}")
         require(
-            0 < self.largest_modulus < 1,
-            f"largest_modulus: expected above 0 and below 1, found {self.largest_modulus}",
+            0 < self.largest_modulus < 1, f"largest_modulus: expected above 0 and below 1, found {self.largest_modulus}"
         )
 
 

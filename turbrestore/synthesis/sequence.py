@@ -131,9 +131,7 @@ def record(image: FloatArray, camera: CameraParams, rng: np.random.Generator) ->
 
 
 def exposed_frame(
-    scene: ArrayLike,
-    sub_flows: Iterable[FloatArray],
-    blur: Callable[[FloatArray, int], FloatArray] | None = None,
+    scene: ArrayLike, sub_flows: Iterable[FloatArray], blur: Callable[[FloatArray, int], FloatArray] | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Average a scene displaced by the flow of each sub-frame.
 

@@ -130,7 +130,7 @@ def variance_by_blur(fused: FloatArray, fidelity: float, widths: tuple[float, fl
 
 
 def quadratic_fidelity(fused: FloatArray, method: str, fidelity: float) -> float:
-    """Return the weight λ with which a quadratic prior stands for that of a deconvolution.
+    """Return the weight λ with which a quadratic prior approximates that of a deconvolution.
 
     It is the automatic weight for wiener, times the ratio of the weight that was used to the automatic one; for wiener
     this is the weight that was used.

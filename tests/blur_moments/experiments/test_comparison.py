@@ -11,7 +11,7 @@ from turbrestore.blur_moments.experiments.scenarios import mirror_setup, record,
 from turbrestore.blur_moments.state_estimation.image_observer import ImageFilter
 from turbrestore.blur_moments.state_estimation.observers import steady_kalman
 from turbrestore.core.errors import ConfigurationError
-from turbrestore.filtering.kalman import Gaussian
+from turbrestore.filtering.estimates import Gaussian
 
 # Standard deviation of the slope for the process noise W = .1 that paper 1 prints.
 PRINTED = 0.1**0.5

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from ...core.errors import require
-from ...filtering.kalman import Gaussian
+from ...filtering.estimates import Gaussian
 from ...runtime.threads import map_ahead
 from ..moments import BlurModel, predicted_moments
 from ..sensor import ExposureTiming, Float64Array

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...core.errors import require_between
-from ...filtering.kalman import Gaussian
+from ...filtering.estimates import Gaussian
 from ..moments import BlurModel, Motion
 from ..sensor import ExposureTiming, Float64Array, GaussianKernel, LineSensor, PixelGrid, expose
 from ..state_estimation.augmented import Oscillator, OscillatorMotion

@@ -23,7 +23,8 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 
 from ...core.errors import require
-from ...filtering.kalman import Gaussian, predict
+from ...filtering.estimates import Gaussian
+from ...filtering.kalman import predict
 from ..sensor import ExposureTiming, Float64Array
 
 

@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.errors import ConfigurationError, DataError, require
-from ...filtering.kalman import Gaussian, Innovation, update_information
+from ...filtering.estimates import Gaussian
+from ...filtering.kalman import Innovation, update_information_form
 from ..moments import BlurModel
 from ..sensor import Float64Array
 
@@ -70,7 +71,7 @@ class ImageFilter:
         found, batch = x.reshape(state.mean.shape), state.mean.shape[:-1]
         prior = state if problem.has_prior else Gaussian(found, state.cov / _WEAK)
         linear, H = linear.reshape(*batch, -1), H.reshape(*batch, *H.shape[1:])
-        after, innovation = update_information(prior, linear, H, 1.0)
+        after, innovation = update_information_form(prior, linear, H, 1.0)
         return (after if problem.has_prior else Gaussian(found, after.cov)), innovation
 
 

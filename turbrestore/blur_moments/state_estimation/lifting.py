@@ -27,7 +27,8 @@ from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
 from ...core.errors import ConfigurationError, require
-from ...filtering.kalman import Gaussian, predict
+from ...filtering.estimates import Gaussian
+from ...filtering.kalman import predict
 from ..sensor import ExposureTiming, Float64Array
 
 # A direction of the state counts as unobservable below this share of the strongest effect on the output (float64).

@@ -7,7 +7,7 @@ runs all of them.  The observers on the whole image are in :mod:`.image_observer
 
 Symbols (paper 1, section V; paper 2, section IV)
 -------------------------------------------------
-x̂, P : mean and covariance of the state, :class:`~turbrestore.filtering.kalman.Gaussian`.
+x̂, P : mean and covariance of the state, :class:`~turbrestore.filtering.estimates.Gaussian`.
 y^(p), h : measured and predicted moments of the frame, :func:`.moments.predicted_moments`.
 C_s, H : derivative of the moments with respect to the state.
 L : gain of the Luenberger observer; K : gain of the Kalman filter.
@@ -30,7 +30,8 @@ from numpy.typing import ArrayLike
 from scipy.linalg import solve_discrete_are
 
 from ...core.errors import ConfigurationError, DataError, require
-from ...filtering.kalman import Gaussian, Innovation, predict, update
+from ...filtering.estimates import Gaussian
+from ...filtering.kalman import Innovation, predict, update_covariance_form
 from ..moments import BASES, BlurModel, image_moments, moment_noise, predicted_moments
 from ..sensor import Float64Array
 from .image_observer import ImageFilter
@@ -57,7 +58,7 @@ class FixedGain:
         expected, H, R = predicted_moments(model, state.mean, model.check_inputs(state, inputs), (1,))
         measured = image_moments(frame, model.sensor.pixels, 1, total=model.sensor.total)[..., 1:]
         # The covariance of the innovation is that of the Kalman update; only the gain differs.
-        _, innovation = update(state, measured, H, R, expected)
+        _, innovation = update_covariance_form(state, measured, H, R, expected)
         F = np.eye(order) - self.gain[:, None] * H
         cov = F @ state.cov @ np.swapaxes(F, -1, -2) + np.outer(self.gain, self.gain) * R
         mean = state.mean + (measured - expected) * self.gain
@@ -89,7 +90,7 @@ class MomentFilter:
         else:
             expected, H, R = predicted_moments(model, state.mean, values, self.orders, self.basis)
         measured = image_moments(frame, pixels, max(self.orders), self.basis, total)[..., list(self.orders)]
-        return update(state, measured, H, R, expected)
+        return update_covariance_form(state, measured, H, R, expected)
 
 
 Observer = FixedGain | MomentFilter | ImageFilter

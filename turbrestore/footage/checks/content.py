@@ -189,7 +189,7 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
 
 
 def _of_file(backdrop: Backdrop, source: FrameSource) -> Backdrop:
-    """Place what belongs to the selected rows and columns among all of the file."""
+    """Bring a backdrop of the selected rows and columns to the size of the frames in the file."""
     values = np.zeros(source.file_shape[1:], np.float32)
     unseen = np.zeros(source.file_shape[1:3], bool)
     values[source.window], unseen[source.window] = backdrop.values, backdrop.unseen
@@ -242,7 +242,7 @@ class _ContentScan:
         # A running estimate of the median, because blank frames must reach neither the scenes nor the stuck pixels.
         self._usual += 0.1 * (max(contrast, _LEAST_CONTRAST) - self._usual) if self._usual else contrast
         if contrast > max(_LEAST_CONTRAST, self._params.blank_contrast * self._usual):
-            # Stuck pixels stand alone in the mosaic; interpolation of colours spreads them.
+            # Stuck pixels are isolated in the mosaic; interpolation of colours spreads them.
             self._stuck.update(values if mosaic is None else self._planes(mosaic))
             self._scenes.update(thumb)
         else:

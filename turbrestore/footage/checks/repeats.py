@@ -6,7 +6,7 @@ d : difference of a frame from the one before, where edges are: the 80th percent
 σ : noise of the frame
 
 Frames of a scene behind moving air differ along edges by its motion, and everywhere by √2 σ; a frame that is recorded
-again, from a picture that stands, differs by less than σ and by far less than frames that are not.  In a clip in which
+again, from a static picture, differs by less than σ and by far less than frames that are not.  In a clip in which
 nearly all differ little, nothing moves, and no frame is taken for a repeat.
 """
 

@@ -21,6 +21,7 @@ _FEWEST_FRAMES = 10
 _DENSE_FRAMES = 8
 # A lone pixel exceeds its highest neighbour by this share of its distance from the median of all neighbours.
 _ALONE = 0.8
+# Largest change of a stuck pixel, least mean change of its neighbours, and still neighbours that make it a letter.
 _STILL, _MOVING, _OF_LETTER = 1.5 / 255, 8 / 255, 1
 _RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 _AROUND = np.array([(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)])
@@ -55,7 +56,7 @@ class StuckPixelDetector:
         moves = self._highest - self._lowest
         moved = moves.mean(axis=1) >= _MOVING
         still = (self._most - self._least <= _STILL) & moved
-        # A neighbour that stands too, while others move, is part of a letter of a title.
+        # A neighbour that is stuck too, while others move, is part of a letter of a title.
         letter = moved & ((moves <= _STILL).sum(axis=1) >= _OF_LETTER)
         stuck = self._places[(still | (self._alone >= _ALONE)) & ~letter]
         return none if len(stuck) > _MOST_STUCK * self._size else stuck

@@ -5,9 +5,9 @@ Symbols
 f : a frame; r : the reference, a mean of frames; both reduced and blurred, so that motion of the air hardly counts
 g(y) : gain of the frame at row y of the frame, a constant and cosines; b : its offset
 
-``f(x + d) ≈ g(y) r(x) + b`` is fitted by least squares, reweighted so that what passes through the scene does not
-count; d is the shift of the whole frame.  A frame is corrected to ``(f − b) / g``.  The gains of all frames are 1 on
-average, row by row, so that the mean of the frames stays.
+``f(x + d) ≈ g(y) r(x) + b`` is fitted by least squares, reweighted so that moving objects do not count; d is the shift
+of the whole frame.  A frame is corrected to ``(f − b) / g``.  The gains of all frames are 1 on average, row by row, so
+that the mean of the frames stays.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ _SIDE = 96
 _BLUR, _LEAST_BLUR = 4.0, 1.5
 # Cosines along the rows: bands as narrow as an eighth of the frame are followed.
 _COSINES = 16
-# Change of a frame by its gain, or by bands, relative to the contrast of the scene, from which light changes.  Steady
-# simulated and real clips reach 0.01, and 0.03 along the rows where somebody walks through.
+# Least change by the gain of a frame, and by bands, relative to the contrast of the scene, that is corrected.  Clips
+# under steady light, simulated and real, reach 0.01, and 0.03 along the rows where somebody walks through.
 _LEAST_CHANGE, _LEAST_BANDS = 0.025, 0.06
-# Share of these below which no model is fitted, as means over a frame include what passes through the scene.
+# Share of these below which no model is fitted, as means over a frame include moving objects.
 _CLEARLY = 0.7
 # Share of the residual that a model has to explain of what a simpler one leaves.
 _EXPLAINED = 0.3
@@ -42,7 +42,7 @@ _SATURATED = 0.995
 # Weight of a cosine of order j against its square, relative to the information of the frame.
 _SMOOTHNESS = 1e-4
 _ROUNDS = 4
-# Frames that tell whether there are bands.
+# Frames of the sample in which bands are looked for.
 _SOME = 24
 # Rows at which gains are compared, the percentage of frames beyond the range that they wander in, and the least gain.
 _NODES, _FEW, _LEAST_GAIN = 64, 5, 0.05
@@ -93,7 +93,7 @@ def _measure_light(survey: Survey, frames: FloatArray) -> tuple[Light | None, tu
     if reference is None:
         return None, ()
     anchor = prepare_shift_reference(_at_unit_contrast(np.nan_to_num(reference)))
-    # Bands are in all frames or in none, so that some of them tell.
+    # Bands are in all frames or in none, so a sample shows them.
     some = frames[:: max(len(frames) // _SOME, 1)] if as_a_whole else frames
     light = _chosen([_fit_frame(frame, reference, anchor) for frame in some])
     if light is not None and len(some) < len(frames):

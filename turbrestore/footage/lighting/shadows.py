@@ -5,10 +5,10 @@ Symbols
 f : a frame; r : the median of the frames at every place; both reduced and blurred, and at one exposure
 g : gain of a frame, a smooth field; G∗ a Gaussian average
 
-``g = G∗(w r f) / G∗(w r²)`` is the fit of ``f ≈ g r`` in a window, with weights w that leave out what passes through
-the scene.  Motion of the air moves f off g r by its displacement times the gradient of r, which has both signs in a
-window and hardly changes g; a shadow changes all of it.  The fields of all frames are 1 on average, in the logarithm,
-so that the light of the mean stays.
+``g = G∗(w r f) / G∗(w r²)`` is the fit of ``f ≈ g r`` in a window, with weights w that leave moving objects out.
+Motion of the air moves f off g r by its displacement times the gradient of r, which has both signs in a window and
+hardly changes g; a shadow changes all of it.  The fields of all frames are 1 on average, in the logarithm, so that the
+light of the mean stays.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from ...registration.camera.global_shift import known_shifts
 _REACH, _REACH_BLURS = 0.045, 2.0
 # Fewest frames of which a median says anything.
 _FEWEST = 8
-# Deviation over time of the logarithm of g, the largest of nine tenths of the frame, from which light changes in place,
-# and the share of the squared residual that g has to explain.
+# Least deviation over time of the logarithm of g that is corrected, its percentile over the frame, and the share of the
+# squared residual that g has to explain.
 # Behind moving air, with walkers, snow, rain or noise, g explains up to six tenths of it.
 _LEAST_CHANGE, _MOST_OF, _EXPLAINED = 0.03, 90, 0.8
-# Largest shift of a camera that stands, pixels of the reduced frames, root mean square.
-_STANDS = 1.0
+# Largest shift of a static camera, pixels of the reduced frames, root mean square.
+_STATIC = 1.0
 # Gains are limited to this factor; what is added to r, as a share of its bright parts: dark ones count less.
 _LARGEST, _DARK, _BRIGHT = 3.0, 0.03, 95
 _ROUNDS = 3
@@ -83,7 +83,7 @@ def measure_shade(
     if change < _LEAST_CHANGE or explained[1] > (1 - _EXPLAINED) * explained[0]:
         return None, ()
     shifts = known_shifts(frames / max(float(frames.std()), 1e-6))[0]
-    if float(np.square(shifts - shifts.mean(axis=0)).sum(axis=1).mean()) > _STANDS**2:
+    if float(np.square(shifts - shifts.mean(axis=0)).sum(axis=1).mean()) > _STATIC**2:
         return None, ()
     gains = np.exp(logarithms).astype(np.float16)
     low, high = (float(value) for value in np.percentile(gains, (1, 99)))

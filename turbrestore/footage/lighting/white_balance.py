@@ -3,8 +3,8 @@
 Symbols
 -------
 f : a frame; r : the mean of the frames; both reduced and blurred, so that motion of the air hardly counts
-G : gain of a channel of a frame, or of its luminance, from ``f ≈ G r`` by least squares, reweighted so that what passes
-    through the scene does not count
+G : gain of a channel of a frame, or of its luminance, from ``f ≈ G r`` by least squares, reweighted so that moving
+    objects do not count
 
 A channel is divided by its gain over that of the luminance.  These ratios are 1 on average, in the logarithm, so that
 the colours of the mean stay.

@@ -23,7 +23,7 @@ numbers                             intensity
 16 or 32 bits, BZERO of the middle  unsigned: 0 to 65535, or to 4294967295
 floating point in [0, 1]            as they are
 all others, with BSCALE and BZERO   0, or the lowest value of all frames if that is negative, becomes black; the
-                                    highest value of all frames becomes white, but for values that stand alone far
+                                    highest value of all frames becomes white, but for isolated values far
                                     beyond the others, which are clipped; a remark says so
 NaN, BLANK                          missing: filled from around, where a frame has up to 1 % of them
 ==================================  =========================================================================

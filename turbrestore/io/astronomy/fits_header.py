@@ -51,7 +51,7 @@ class FitsImage:
     dtype: np.dtype[Any]  # of the numbers in the file
     offset: int  # of the first number, bytes
     scale: tuple[float, float]  # BSCALE and BZERO: the value of a number is BSCALE · number + BZERO
-    blank: int | None  # integer that stands for a missing value
+    blank: int | None  # integer that marks a missing value
     notes: tuple[str, ...]  # what is unusual
     # Colours of the first pixels of the file, where the header says that they are those of a Bayer sensor.
     bayer: str | None = None
@@ -75,7 +75,7 @@ class FitsImage:
                     return np.array(tiled[self.tiles].data)
             with _opened(self.path) as file:
                 data = file.read(end)
-                # The checksum stands at the end; what other images follow is passed over.
+                # The checksum is at the end; the images that follow it are skipped.
                 for _ in range(end, limits.max_bytes, _PIECE):
                     if not file.read(_PIECE):
                         break
@@ -195,7 +195,7 @@ def _image(path: Path, cards: list[str], header: Header, offset: int) -> FitsIma
     notes = []
     bottom_up = str(header.get("ROWORDER", "")).strip().upper() == "BOTTOM-UP"
     if bottom_up:
-        notes.append("rows stand from the bottom up, and keep the order of the file")
+        notes.append("rows run from the bottom up, and keep the order of the file")
     pattern = str(header.get("BAYERPAT", "")).strip()
     bayer = _first_colours(pattern, header, shape[-2] if bottom_up and len(shape) > 1 else None)
     if pattern and bayer is None:

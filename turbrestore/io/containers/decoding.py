@@ -263,13 +263,7 @@ def _declared_duration(stream: av.VideoStream) -> float | None:
 
 
 def _frames(
-    path: Path,
-    layout: PixelFormat,
-    chosen: Sequence[int],
-    intra: bool,
-    interlaced: bool,
-    limits: Limits,
-    scan: _Scan,
+    path: Path, layout: PixelFormat, chosen: Sequence[int], intra: bool, interlaced: bool, limits: Limits, scan: _Scan
 ) -> Iterator[PixelArray]:
     import av
 

@@ -200,7 +200,7 @@ def _tag(stream: av.VideoStream, colour: tuple[int, int] | None, is_rgb: bool) -
 
 
 def _ticks(sound: Soundtrack | None, rate: Fraction) -> tuple[list[int] | None, Fraction]:
-    """Return times of frames and their unit, seconds; None stands for their numbers, where the times are regular."""
+    """Return times of frames and their unit, seconds; None in place of the times where they are regular."""
     intervals = np.zeros(0) if sound is None else np.diff(sound.times)
     if sound is None or len(intervals) < 2 or np.ptp(intervals) <= _IRREGULAR * float(np.median(intervals)):
         return None, 1 / rate

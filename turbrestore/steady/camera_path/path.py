@@ -10,9 +10,9 @@ e : by what turbulence moves whole frames, pixels
 ε_i, σ_i : what fit i leaves, root mean square; standard deviation of its value at k, from ε_i and ρ_i
 ρ_i : correlation of what fit i leaves in successive frames: a mean varies √((1 + ρ) / (1 − ρ)) times as much by it
 
-Turbulence moves whole frames as well, but at random about where the camera is, and a camera stands, pans and zooms at
+Turbulence moves whole frames as well, but at random about where the camera is, and a camera rests, pans and zooms at
 constant velocity for a while.  A parabola through a few frames follows whatever the camera does and averages little; a
-line through many averages much, without a lag behind a pan; a mean of many is best while the camera stands.  The fits
+line through many averages much, without a lag behind a pan; a mean of many is best while the camera rests.  The fits
 are taken in this order, as long as each agrees with the one before (the intersection of confidence intervals of
 Goldenshluger and Nemirovski 1997): fit i has the share ::
 
@@ -38,8 +38,8 @@ LONGEST = 48
 # Fits: frames on either side of k, and order of the polynomial; fewest frames of a fit.
 _FITS = (6, 2), (6, 1), (12, 1), (24, 1), (LONGEST, 1), (LONGEST, 0)
 _FEWEST = 4
-# κ, less for a camera that stands, since that is the assumption that a slow pan breaks.
-_DOUBT, _STANDING = 2.0, 1.5
+# κ, less for a static camera, since that is the assumption that a slow pan breaks.
+_DOUBT, _RESTING = 2.0, 1.5
 _AT_ENDS = 0.5
 # Frames from one to the next whose residuals are compared, and the greatest correlation ρ that they count for.
 _SUCCESSIVE, _MOST_ALIKE = 2, 0.95
@@ -89,7 +89,7 @@ def smooth_motion(path: Mapping[int, Matrix], tolerance: float, shape: tuple[int
         share *= 1 / (1 + (size / max(tolerance, _LEAST)) ** 8)
         if before is not None:
             differs = camera_size((value - before).reshape(2, 3), shape)
-            share *= 1 / (1 + (differs / max((_DOUBT if order else _STANDING) * doubt, _LEAST)) ** 4)
+            share *= 1 / (1 + (differs / max((_DOUBT if order else _RESTING) * doubt, _LEAST)) ** 4)
         smooth = smooth + share * (value - smooth)
         doubt = size * spread * _alikeness(times[near], left)
     return smooth.reshape(2, 3)
@@ -122,7 +122,7 @@ def motion(pose: Matrix) -> Matrix:
 
 
 def _samples(path: Mapping[int, Matrix]) -> tuple[Matrix, Matrix, Matrix]:
-    """Arrange a path: times, motions as rows, and the number of frames that each stands for, as some are skipped."""
+    """Arrange a path: times, motions as rows, and the number of frames that each counts for, as some are skipped."""
     times = np.array(sorted([*path, 0]), np.float64)
     seen = np.stack([path[int(time)] if time else np.zeros((2, 3)) for time in times]).reshape(-1, 6)
     return times, seen, np.gradient(times) if len(times) > 1 else np.ones(1)

@@ -1,4 +1,4 @@
-"""What passes through the scene is left out, though it is sharp and covers a pixel in up to 30 % of the frames."""
+"""Moving objects are left out by the filter, though they are sharp and cover a pixel in up to 30 % of the frames."""
 
 import cv2
 import numpy as np
