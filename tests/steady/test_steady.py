@@ -47,6 +47,19 @@ def shaken(truth, rms=0.6, seed=0):
     return [(frame + rng.normal(0, 0.01, frame.shape)).astype(np.float32) for frame in frames]
 
 
+@pytest.mark.parametrize("live", [False, True])
+def test_a_title_keeps_the_pixels_of_its_frame(live):
+    rim, letters = np.zeros((2, SIZE, SIZE), np.uint8)
+    for canvas, width in ((rim, 3), (letters, 1)):
+        cv2.putText(canvas, "GATE 7", (6, 118), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 255, width)
+    frames = [np.where(rim == 255, letters == 255, frame).astype(np.float32) for frame in shaken([0.8 * photo()] * 14)]
+    letters = letters == 255
+    assert letters.sum() > 20
+    for ours, seen in list(zip(images(frames, sigma=0.8, live=live), frames, strict=True))[6:]:
+        np.testing.assert_allclose(ours[letters], seen[letters], atol=1e-3)
+        assert not np.allclose(ours[:90], seen[:90], atol=1e-3)
+
+
 @pytest.mark.long
 def test_frames_of_a_still_scene_come_nearer_to_the_truth():
     # A scene and a seed that suit the method; docs/steady.md has others, with smaller gains.

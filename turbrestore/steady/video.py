@@ -5,6 +5,7 @@
 2. Where the scene is static it is fused with the memory of all frames before (:mod:`turbrestore.steady.memory`).
 3. One blur, estimated from an early frame of the clip, is removed from every frame by linear filters
    (:mod:`turbrestore.steady.deblurring`); from what is remembered, one that is estimated there.
+4. A title, where a static camera has drawn one, keeps the pixels of its frame (:mod:`turbrestore.footage.overlays`).
 
 What is carried from frame to frame is the memory, the blurs and, where the camera is locked, its path.
 """
@@ -24,6 +25,9 @@ from ..blur.posterior import BlurWitnesses, blur_posterior, measure_witnesses
 from ..blur.psf import KOLMOGOROV
 from ..blur.witnesses.image_evidence import image_evidence
 from ..core.arrays import FloatArray, luminance
+from ..footage.overlays import Title, without_overlay
+from ..footage.survey import take_survey
+from ..io.source import FrameSource
 from ..registration.warp import sample_linear, warp
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import map_in_turns, one_thread_each
@@ -120,12 +124,12 @@ def steady_frames(
     sigma, exponent, witnesses = params.sigma, KOLMOGOROV, None
     if head and sigma is None:
         sigma, exponent, witnesses = _find_first(head[-1], params, runtime)
-    width = sigma or 0.0
+    width, title = sigma or 0.0, _find_title(head[-1]) if head else None
     scenes = _Scenes(params, width, witnesses, runtime)
     yield from map_in_turns(
         lambda window: dewarp_frame(window, params),
         lambda frame: (frame, scenes.estimate(frame)),
-        lambda pair: _sharpened(*pair, width, exponent),
+        lambda pair: _sharpened(*pair, width, exponent, title),
         chain(head, windows),
         runtime.threads,
     )
@@ -133,15 +137,25 @@ def steady_frames(
 
 def _one_by_one(windows: Iterable[Window], params: SteadyParams, runtime: Runtime) -> Iterator[SteadyFrame]:
     """Frames of a live stream, each before the next is asked for.  OpenCV shares out what one frame takes."""
-    sigma, exponent = params.sigma or 0.0, KOLMOGOROV
+    sigma, exponent, title = params.sigma or 0.0, KOLMOGOROV, None
     scenes = _Scenes(params, sigma, None, runtime)
     with nullcontext() if runtime.threads != 1 else one_thread_each():
         for window in windows:
-            if params.sigma is None and window.number == params.reach // 2:
-                sigma, exponent, witnesses = _find_first(window, params, runtime)
-                scenes.remove(sigma, witnesses)
+            if window.number == params.reach // 2:
+                title = _find_title(window)
+                if params.sigma is None:
+                    sigma, exponent, witnesses = _find_first(window, params, runtime)
+                    scenes.remove(sigma, witnesses)
             frame = dewarp_frame(window, params)
-            yield _sharpened(frame, scenes.estimate(frame), sigma, exponent)
+            yield _sharpened(frame, scenes.estimate(frame), sigma, exponent, title)
+
+
+def _find_title(window: Window) -> Title | None:
+    """Find the title that a static camera has drawn over the frames of a window."""
+    frames = {0: window.frame, **window.neighbours}
+    # A stream is not held to the range that a clip is.
+    stack = np.stack([np.clip(luminance(frames[offset].image), 0, 1) for offset in sorted(frames)])
+    return without_overlay(take_survey(FrameSource.from_array(stack)))[2]
 
 
 def _find_first(window: Window, params: SteadyParams, runtime: Runtime) -> tuple[float, float, BlurWitnesses]:
@@ -262,15 +276,22 @@ def _placed(image: FloatArray, moving: NDArray[np.bool_], offset: Matrix) -> tup
 
 
 def _sharpened(
-    frame: DewarpedFrame, estimate: tuple[Memory, NDArray[np.bool_], float], sigma: float, exponent: float
+    frame: DewarpedFrame,
+    estimate: tuple[Memory, NDArray[np.bool_], float],
+    sigma: float,
+    exponent: float,
+    title: Title | None,
 ) -> SteadyFrame:
     memory, moving, width = estimate
     noise = frame.noise * frame.share
     remembered = noise / float(np.sqrt(memory.held.mean()))
-    image = deblur(memory.image, (sigma, round(width, 2)), exponent, (noise, remembered), memory.held)
+    sharp = deblur(memory.image, (sigma, round(width, 2)), exponent, (noise, remembered), memory.held)
+    image = relit(sharp, frame.light)
+    if title is not None:
+        image = replace(title, frame=frame.seen.image).put_back(image)
     return SteadyFrame(
         number=frame.number,
-        image=relit(image, frame.light),
+        image=image,
         moving=moving,
         displacement=frame.displacement,
         sigma=sigma,
