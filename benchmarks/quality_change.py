@@ -1,8 +1,8 @@
 """What has changed since a revision in the images of the clips with truth or text; ``quality.py --before`` prints it.
 
 The earlier tree restores by its defaults, the present one by a preset, both from the same frames.  PSNR has bounds, on
-the clips that settings were chosen on as on those that nothing was chosen on.  Words have none: what tesseract reads of
-a line changes with the last bits of an image.
+the clips that settings were chosen on as on those that nothing was chosen on.  Words have none: noise of 0.00001 in
+the frames moves the share of a clip by 0.02.  Their change has the standard error that is due to the reader alone.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from clips import Clip, find_clips, is_reported
 from revisions import child, revision
-from words import can_read, share_read
+from words import DITHERED_COPIES, can_read, shares_read
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import InputNotFoundError
@@ -33,7 +33,7 @@ Pair = tuple[float, float]
 Restored = tuple[dict[str, FloatArray], float]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Change:
     """Figures of a clip, before and now.
 
@@ -41,14 +41,14 @@ class Change:
     ----------
     psnr : dict of str to pair of float
         Of each stage, dB; none without truth.
-    words : pair of float, optional
-        Share of the words that are read in the result.
+    words : ndarray, shape (2, DITHERED_COPIES), optional
+        Share of the words that are read in copies of the result.
     time : float
         Processor time now over that before.
     """
 
     psnr: dict[str, Pair]
-    words: Pair | None
+    words: FloatArray | None
     time: float
 
 
@@ -70,9 +70,10 @@ def compare_with(before: str, patterns: Sequence[str], preset: str = "standard")
         f"What `TURBRESTORE_DATA=DIR python benchmarks/quality.py --before {before} --preset {preset}` measures: clips "
         "of `benchmarks/quality.py` restored from the same frames by the defaults of that revision and by this preset "
         "of the present tree; PSNR, dB, where the truth is known, and the share of the words that tesseract reads "
-        "where there is text.  Words have no bound: what is read of a line changes with the last bits of an image.\n",
-        "| clip | filtered: before | now | change | result: before | now | change | words: before | now |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
+        f"where there is text: the mean over {DITHERED_COPIES} dithered copies, and after ± the standard error of its "
+        "change that is due to the reader.  Words have no bound.\n",
+        "| clip | filtered: before | now | change | result: before | now | change | words: before | now | change |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|",
         *(_row(name, change) for name, change in changes.items()),
         "\n| results of clips | number | mean change, dB | bound | least | bound | CPU, now / before |",
         "|---|---:|---:|---:|---:|---:|---:|",
@@ -99,8 +100,8 @@ def compare_with(before: str, patterns: Sequence[str], preset: str = "standard")
         lines.append(f"| {' | '.join(cells)} | {np.median([change.time for change in part]):.2f} |")
     words = [change.words for change in changes.values() if change.words is not None]
     if words:
-        was, now = np.mean(words, axis=0)
-        lines.append(f"\nWords, mean of {len(words)} clips: {was:.2f} before, {now:.2f} now.")
+        was, now, change = _words_cells(np.mean(words, axis=0))
+        lines.append(f"\nWords, mean of {len(words)} clips: {was} before, {now} now, change {change}.")
     return "\n".join(lines) + "\n", not held
 
 
@@ -119,7 +120,7 @@ def _change(clip: Clip, before: Restored, after: Restored, readable: bool) -> Ch
     (old, old_cpu), (new, new_cpu) = before, after
     if clip.truth is not None:
         psnr = {stage: (compare(old[stage], clip.truth).psnr, compare(new[stage], clip.truth).psnr) for stage in STAGES}
-    words = (share_read(old["result"], clip.words), share_read(new["result"], clip.words)) if readable else None
+    words = np.stack([shares_read(some["result"], clip.words) for some in (old, new)]) if readable else None
     return Change(psnr, words, new_cpu / old_cpu)
 
 
@@ -128,8 +129,15 @@ def _row(name: str, change: Change) -> str:
     for stage in STAGES:
         was, now = change.psnr.get(stage, (None, None))
         cells += ["–"] * 3 if was is None or now is None else [f"{was:.2f}", f"{now:.2f}", f"{now - was:+.3f}"]
-    cells += ["–"] * 2 if change.words is None else [f"{share:.2f}" for share in change.words]
+    cells += ["–"] * 3 if change.words is None else _words_cells(change.words)
     return f"| {' | '.join(cells)} |"
+
+
+def _words_cells(shares: FloatArray) -> list[str]:
+    """Means of shares (2, N) before and now, and their change with its standard error."""
+    changes = shares[1] - shares[0]
+    error = changes.std(ddof=1) / np.sqrt(changes.size)
+    return [*(f"{share:.3f}" for share in shares.mean(axis=1)), f"{changes.mean():+.3f} ± {error:.3f}"]
 
 
 def restored_by(frames: FloatArray, tree: Path | None, preset: str = "standard") -> Restored:
