@@ -13,7 +13,7 @@ from turbrestore.footage.bars import without_bars
 from turbrestore.footage.checks.content import check_content
 from turbrestore.footage.levels import stretch_levels
 from turbrestore.footage.lighting.light import steady_light
-from turbrestore.footage.overlays import read_static_mask, without_overlay
+from turbrestore.footage.overlays import _titles, read_static_mask, without_overlay
 from turbrestore.io.images import write_image
 from turbrestore.io.source import FrameSource
 from turbrestore.metrics import compare
@@ -215,6 +215,13 @@ class TestTitles:
         found = restore(FrameSource.from_array(frames))
         np.testing.assert_allclose(found.image[:6, 50:56], found.mean[:6, 50:56], atol=0.01)
         assert without_overlay(surveyed(plain))[2] is None
+
+    def test_a_few_quiet_pixels_of_a_long_edge_are_no_title(self):
+        clear, drawn = np.zeros((2, 60, 60), bool)
+        clear[5, 5:55], clear[40:48, 30:38] = True, True
+        drawn[5, 20:33], drawn[40:48, 30:38] = True, True
+        found = _titles(drawn, clear)
+        assert not found[5].any() and found[40:48, 30:38].all()
 
 
 class TestClocks:

@@ -64,6 +64,8 @@ _NEAR, _GAP, _FADE = 4, 2, 0.7
 # An edge is drawn over the scene if its deviation is below that of the noise by this factor, or its motion below that
 # of the edges of the scene by this one.
 _NOISELESS, _DRAWN = 0.7, 1 / 8
+# Least share of the clear edges in a title, and of the pixels next to it, that are drawn.
+_LEAST_DRAWN = 1 / 3
 # Strokes of a clock: largest change of a pixel that stays, in units of the noise and in intensity; least share of the
 # frames that have an edge there, and of these in which it stays; fewest connected pixels.
 _SAME, _LEAST_SAME, _OFTEN, _REMAINS, _FEWEST_STROKES = 1.0, 1.5 / 255, 0.2, 0.25, 12
@@ -196,9 +198,8 @@ def _static_regions(
     edges = still & clear & (gradient * np.minimum(_STATIC * motion, 1.0) > deviation)
     # The camera draws a title over its noise, which no edge of the scene lacks; a coder blurs that again.
     noiseless = _NOISELESS * max(usual, _LEAST_STILL / _STILL)
-    drawn = clear & (deviation < np.maximum(_DRAWN * motion * gradient, noiseless))
-    is_drawn = bool(_large(drawn).any())
-    if edges.sum() < _LEAST_EDGES * edges.size and not is_drawn:
+    drawn = _titles(clear & (deviation < np.maximum(_DRAWN * motion * gradient, noiseless)), clear)
+    if edges.sum() < _LEAST_EDGES * edges.size and not drawn.any():
         return None, None
     constant = deviation < _CONSTANT * max(usual, _LEAST_STILL / _STILL)
     # A flat part of the scene does not change either; an overlay lacks the noise of the scene, or is dark like a stop.
@@ -208,11 +209,22 @@ def _static_regions(
     if mask.mean() > _LARGEST:
         return None, None
     mask = _around(mask, _AROUND)
-    if not is_drawn or measured < _LEAST_BENDING:
+    if not drawn.any() or measured < _LEAST_BENDING:
         return mask, None
     letters = _regions((constant & _around(drawn, _NEAR)) | drawn, drawn).astype(np.uint8)
     letters = cv2.morphologyEx(letters, cv2.MORPH_CLOSE, np.ones((2 * _GAP + 1,) * 2, np.uint8))
     return mask, Title(_around(letters, 1), moments.mean, source.window)
+
+
+def _titles(drawn: NDArray[np.bool_], clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Keep drawn pixels in and near regions that have many: in few frames of slow air, other edges hardly move."""
+    closed = cv2.morphologyEx(drawn.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((2 * _GAP + 1,) * 2, np.uint8))
+    count, labels = cv2.connectedComponents(closed, connectivity=8)
+    beside = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8)).astype(int)
+    found, all_edges = (np.bincount(beside[pixels], minlength=count) for pixels in (drawn, clear))
+    many = (found >= _FEWEST_STROKES) & (found >= _LEAST_DRAWN * all_edges)
+    many[0] = False
+    return drawn & _around(many[labels], len(drawn) // _LINE)
 
 
 def _digits(source: FrameSource, moments: Moments, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
