@@ -113,7 +113,10 @@ def test_what_no_frame_shows_is_unknown(clip, tmp_path):
 
 
 def deviation_of(frames, **deconvolution):
-    params = turbrestore.RestoreParams(deconvolution=DeconvolutionParams(method="wiener", **deconvolution))
+    # Squares that are pasted into the frames would be taken for an overlay.
+    params = turbrestore.RestoreParams(
+        static_mask="off", deconvolution=DeconvolutionParams(method="wiener", **deconvolution)
+    )
     found = turbrestore.restore(FrameSource.from_array(np.rint(65535 * frames).astype(np.uint16)), params)
     return found.uncertainty
 
