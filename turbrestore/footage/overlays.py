@@ -217,11 +217,16 @@ def _static_regions(
 
 
 def _titles(drawn: NDArray[np.bool_], clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Keep drawn pixels in and near regions that have many: in few frames of slow air, other edges hardly move."""
+    """Keep drawn pixels in and near regions that have many: in few frames of slow air, other edges hardly move.
+
+    A dark line along the border is no title.
+    """
     closed = cv2.morphologyEx(drawn.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((2 * _GAP + 1,) * 2, np.uint8))
     count, labels = cv2.connectedComponents(closed, connectivity=8)
     beside = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8)).astype(int)
-    found, all_edges = (np.bincount(beside[pixels], minlength=count) for pixels in (drawn, clear))
+    inner = np.zeros_like(drawn)
+    inner[_AROUND:-_AROUND, _AROUND:-_AROUND] = True
+    found, all_edges = (np.bincount(beside[pixels & inner], minlength=count) for pixels in (drawn, clear))
     many = (found >= _FEWEST_STROKES) & (found >= _LEAST_DRAWN * all_edges)
     many[0] = False
     return drawn & _around(many[labels], len(drawn) // _LINE)
