@@ -100,7 +100,7 @@ def test_fits_every_window_in_both_schemes(open_tab):
         else:
             assert run["y"] > parts["[aria-label=Frame]"]["y"] > parts["#frame img"]["y"]
         image = parts["#frame img"]
-        assert image["width"] / image["height"] == pytest.approx(256 / 192, rel=0.02)
+        assert image["width"] / image["height"] == pytest.approx(192 / 144, rel=0.02)
         assert image["width"] > 0.4 * width
 
 
@@ -156,7 +156,7 @@ def test_a_finger_draws_a_region(open_tab, browser):
             touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": at})
         page.wait_for_function("document.querySelector('[aria-label=x]').value !== ''")
         sides = [int(page.get_by_label(name, exact=True).input_value()) for name in ("x", "y", "width", "height")]
-        assert sides == pytest.approx([64, 48, 128, 96], abs=1)
+        assert sides == pytest.approx([48, 36, 96, 72], abs=1)
         # The page stayed where it was, and a tap removes the region.
         assert page.evaluate("scrollY") == 0
         page.touchscreen.tap(box["x"] + 20, box["y"] + 20)
