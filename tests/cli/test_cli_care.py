@@ -56,7 +56,7 @@ def smaller(words):
         "restore": QUICK,
         "batch": [*QUICK, "--workers", "1"],
         "deconvolve": STEPS,
-        "synthesize": ["--size", "64x64"],
+        "synthesize": ["--size", "64x64", *([] if "--like" in words else ["--pupil-samples", "24"])],
     }.get(words[0], [])
     blurred = words[0] in ("restore", "deconvolve") and not {"--sigma", "--sweep"} & set(words)
     return [*quick, "--sigma", "1"] if blurred else quick

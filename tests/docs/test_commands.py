@@ -76,6 +76,7 @@ def smaller(line, reports):
     if words[0] == "synthesize":
         is_scene = words[1].isalpha() and words[1] != "centroid"
         taken += ["--size", "72x72"] if is_scene and "--size" not in words else []
+        taken += ["--layers", "2", "--pupil-samples", "24"] if is_scene and "--like" not in words else []
         taken = drop(taken, "--frames")
     if words[0] in ("steady", "moments"):
         taken = drop(taken, "--frames" if words[0] == "steady" else "--seeds")
