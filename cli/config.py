@@ -61,7 +61,7 @@ def template(app: App, preset: Preset) -> str:
     """Every setting of ``restore`` as TOML, with the values of a preset, explained by the words that ``--help`` has."""
     chosen = {"preset": preset, **dict(_values(preset_settings(preset)))}
     tables: dict[str, list[str]] = {"": []}
-    for key, argument in _settings(app).items():
+    for key, argument in _settings(app, explained=True).items():
         table, _, name = key.rpartition(".")
         value = chosen.get(key, argument.field_info.default)
         tables.setdefault(table, []).append(_entry(name, argument, value))
@@ -75,8 +75,8 @@ def template(app: App, preset: Preset) -> str:
     return "\n".join(parts)
 
 
-def _settings(app: App) -> dict[str, Argument]:
-    return settings(app["restore"].assemble_argument_collection(parse_docstring=True))
+def _settings(app: App, explained: bool = False) -> dict[str, Argument]:
+    return settings(app["restore"].assemble_argument_collection(parse_docstring=explained))
 
 
 def _entry(name: str, argument: Argument, value: Any) -> str:

@@ -4,6 +4,8 @@ from turbrestore.io.video import write_video
 
 # One pass each, for tests that look at files and words and not at the image.
 QUICK = ["--centroid.iterations", "1", "--filter.inner-iterations", "1", "--quiet"]
+# And a known blur, all but left as it is, where the blur does not matter either.
+QUICKEST = ["--sigma", "1", "--deconvolution.iterations", "3", *QUICK]
 
 
 def fails(result, code, *parts):

@@ -4,7 +4,6 @@ import base64
 import contextlib
 import http.client
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -15,10 +14,12 @@ import pytest
 
 from conftest import make_sequence
 from turbrestore.io.images import write_image
-from turbrestore.io.video import write_video
+from turbrestore.io.video import open_frames, write_video
 
 EVIL = "<img src=x onerror=document.title='taken'>.mkv"
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "chart.mkv"
+# Of the sample clip, x, y, width, height: larger than what a preview shows.
+PART = (32, 24, 192, 144)
 # Seconds until a run must have ended, on a machine that does other things too.
 LONG = 60_000
 
@@ -51,7 +52,7 @@ class App:
 @pytest.fixture(scope="module")
 def app(tmp_path_factory):
     folder, temporary = tmp_path_factory.mktemp("start"), tmp_path_factory.mktemp("temporary")
-    shutil.copy(SAMPLE, folder)
+    write_video(folder / "chart.mkv", open_frames(SAMPLE, roi=PART).read(), 25)
     (folder / EVIL).write_bytes(SAMPLE.read_bytes()[:3000])
     write_video(folder / "small.mkv", make_sequence(seed=4, count=8, size=64).frames, 25)
     (folder / "images").mkdir()
@@ -72,38 +73,39 @@ def app(tmp_path_factory):
     assert made <= {f"{name}.png{suffix}" for name in ("saved", "again") for suffix in ("", ".toml")}
 
 
-@contextlib.contextmanager
-def tabs(browser, address, watch=lambda page: None):
-    """Gives what opens a tab of the app, which ``watch`` sees before it loads; at the end all are closed."""
-    contexts = []
+@pytest.fixture(scope="module")
+def window(browser, app):
+    """A window with a tab of the app that stays: others share its process, which has compiled the scripts."""
+    with contextlib.closing(browser.new_context()) as window:
+        load(window.new_page(), app)
+        yield window
 
-    def open_one(size=(1280, 860), **options):
-        contexts.append(browser.new_context(viewport={"width": size[0], "height": size[1]}, **options))
-        page = contexts[-1].new_page()
-        watch(page)
-        page.goto(address)
-        page.locator("#frame img").wait_for()
-        page.locator("svg.quality").wait_for(state="attached")
-        return page
 
-    yield open_one
-    for context in contexts:
-        context.close()
+def load(page, app):
+    page.goto(app.address)
+    page.locator("#frame img").wait_for()
+    page.locator("svg.quality").wait_for(state="attached")
 
 
 @pytest.fixture
-def open_tab(browser, app):
+def open_tab(window, app):
     """Open a tab; afterwards nothing must have been complained of, and nobody else asked."""
-    complaints, addresses = [], []
+    pages, complaints, addresses = [], [], []
 
-    def watch(page):
+    def open_one(size=(1280, 860), window=window):
+        page = window.new_page()
+        pages.append(page)
         page.on("console", lambda message: complaints.append(message.text))
         page.on("pageerror", lambda error: complaints.append(str(error)))
         page.on("request", lambda request: addresses.append(request.url))
         page.on("websocket", lambda opened: addresses.append(opened.url.replace("ws://", "http://")))
+        page.set_viewport_size({"width": size[0], "height": size[1]})
+        load(page, app)
+        return page
 
-    with tabs(browser, app.address, watch) as open_one:
-        yield open_one
+    yield open_one
+    for page in pages:
+        page.close()
     assert complaints == []
     assert [address for address in addresses if not address.startswith((app.address, "data:", "blob:"))] == []
 
@@ -127,6 +129,13 @@ def push(page, name, key):
 
 def press(page, name):
     page.get_by_role("button", name=name, exact=True).click()
+
+
+def open_another(page, name, frames):
+    """Open another clip of the list, which has so many frames."""
+    press(page, "Another clip")
+    press(page, name)
+    page.get_by_text(f"{frames} frames").first.wait_for()
 
 
 def drop(page, name, data):

@@ -1,7 +1,14 @@
-"""How the app looks: it fits every window, and everything in it can be read and reached."""
+"""How the app looks on phones, tablets and laptops in both schemes: it fits, and everything can be read and reached."""
+
+import contextlib
+import itertools
 
 import pytest
 
+from .conftest import LONG, open_another, press
+
+SIZES = ((390, 844), (768, 1024), (1280, 860), (1440, 900))
+SCHEMES = ("light", "dark")
 pytestmark = pytest.mark.long
 
 # Texts whose contrast with what is behind them is too low by WCAG AA; what is disabled may be.
@@ -49,11 +56,35 @@ FOCUS = """() => {
 }"""
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_fits_every_window_in_both_schemes(open_tab, scheme):
-    page = open_tab((1440, 900), color_scheme=scheme)
-    for width, height in ((1440, 900), (1280, 860), (1024, 768), (899, 700), (768, 1024), (390, 844)):
+def serious(page):
+    """Rules and elements of what axe-core finds serious or worse."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    # Styles of other servers, which it would load, there are none.
+    found = axe.run(page, options={"resultTypes": ["violations"], "preload": False}).response["violations"]
+    return [
+        (each["id"], node["target"])
+        for each in found
+        if each["impact"] in ("serious", "critical")
+        for node in each["nodes"]
+    ]
+
+
+def sideways(page):
+    return page.evaluate("document.documentElement.scrollWidth - innerWidth")
+
+
+def open_all(page):
+    """Open what can be unfolded, and leave out what moves."""
+    page.evaluate("for (const part of document.querySelectorAll('details')) part.open = true")
+    page.add_style_tag(content="* { transition: none !important; animation: none !important; }")
+
+
+def test_fits_every_window_in_both_schemes(open_tab):
+    page = open_tab((1440, 900))
+    sizes = ((1440, 900), (1280, 860), (1024, 768), (899, 700), (768, 1024), (390, 844))
+    for (width, height), scheme in itertools.product(sizes, SCHEMES):
         page.set_viewport_size({"width": width, "height": height})
+        page.emulate_media(color_scheme=scheme)
         page.wait_for_timeout(150)
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         cut = "(labels) => labels.map((label) => label.scrollWidth - label.clientWidth)"
@@ -69,24 +100,64 @@ def test_fits_every_window_in_both_schemes(open_tab, scheme):
         else:
             assert run["y"] > parts["[aria-label=Frame]"]["y"] > parts["#frame img"]["y"]
         image = parts["#frame img"]
-        assert image["width"] / image["height"] == pytest.approx(256 / 192, rel=0.02)
+        assert image["width"] / image["height"] == pytest.approx(192 / 144, rel=0.02)
         assert image["width"] > 0.4 * width
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_everything_can_be_read_and_reached(open_tab, scheme):
-    page = open_tab(color_scheme=scheme)
-    page.evaluate("for (const part of document.querySelectorAll('details')) part.open = true")
-    page.add_style_tag(content="* { transition: none !important; }")
-    page.wait_for_timeout(400)
-    assert page.evaluate(FAINT) == []
-    page.mouse.click(5, 5)
-    reached = []
-    for _ in range(60):
-        page.keyboard.press("Tab")
-        reached.append(page.evaluate(FOCUS))
-        if reached[-1][0] == "BODY":
-            break
-    stops = [stop for stop in reached if stop[0] != "BODY"]
-    assert len(stops) > 30
-    assert [stop for stop in stops if not stop[1] or not stop[2]] == []
+def test_everything_can_be_read_and_reached(open_tab):
+    page = open_tab()
+    open_all(page)
+    for scheme in SCHEMES:
+        page.emulate_media(color_scheme=scheme)
+        page.wait_for_timeout(400)
+        assert (scheme, page.evaluate(FAINT)) == (scheme, [])
+        page.mouse.click(5, 5)
+        reached = []
+        for _ in range(60):
+            page.keyboard.press("Tab")
+            reached.append(page.evaluate(FOCUS))
+            if reached[-1][0] == "BODY":
+                break
+        stops = [stop for stop in reached if stop[0] != "BODY"]
+        assert len(stops) > 30
+        assert (scheme, [stop for stop in stops if not stop[1] or not stop[2]]) == (scheme, [])
+
+
+def test_axe_finds_nothing_serious_in_any_window(open_tab):
+    page = open_tab(SIZES[-1])
+    open_another(page, "small.mkv", 8)
+    press(page, "Run")
+    page.get_by_text("64×64 pixels from 8 frames").wait_for(timeout=LONG)
+    press(page, "Compare widths")
+    page.get_by_text("4 of 4 widths").wait_for(timeout=LONG)
+    open_all(page)
+    views = itertools.cycle(("Clip", "Compare", "Widths"))
+    for size, scheme in itertools.product(SIZES, SCHEMES):
+        page.set_viewport_size({"width": size[0], "height": size[1]})
+        page.emulate_media(color_scheme=scheme)
+        for _ in range(2):
+            press(page, view := next(views))
+            assert (size, view, sideways(page)) == (size, view, 0)
+        assert (size, scheme, view, serious(page)) == (size, scheme, view, [])
+    # A fault is found.
+    page.evaluate("document.querySelector('.side').append(document.createElement('button'))")
+    assert [rule for rule, _ in serious(page)] == ["button-name"]
+
+
+def test_a_finger_draws_a_region(open_tab, browser):
+    with contextlib.closing(browser.new_context(has_touch=True, is_mobile=True)) as phone:
+        page = open_tab(SIZES[0], phone)
+        box = page.locator("#frame").bounding_box()
+        touch = phone.new_cdp_session(page)
+        for kind, share in (("touchStart", 0.25), ("touchMove", 0.4), ("touchMove", 0.75), ("touchEnd", None)):
+            at = (
+                [] if share is None else [{"x": box["x"] + share * box["width"], "y": box["y"] + share * box["height"]}]
+            )
+            touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": at})
+        page.wait_for_function("document.querySelector('[aria-label=x]').value !== ''")
+        sides = [int(page.get_by_label(name, exact=True).input_value()) for name in ("x", "y", "width", "height")]
+        assert sides == pytest.approx([48, 36, 96, 72], abs=1)
+        # The page stayed where it was, and a tap removes the region.
+        assert page.evaluate("scrollY") == 0
+        page.touchscreen.tap(box["x"] + 20, box["y"] + 20)
+        page.wait_for_function("document.querySelector('[aria-label=x]').value === ''")

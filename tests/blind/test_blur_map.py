@@ -10,7 +10,7 @@ import pytest
 from turbrestore.blind.blur_map import _like, blur_map_steps, estimate_blur_map, sigma_map, varying_deconvolution_steps
 from turbrestore.blind.guards import GuardParams
 from turbrestore.blind.remove_blur import remove_blur
-from turbrestore.blur.estimation import BlurCandidate, BlurEstimate, choose_blur, estimate_blur, find_candidates
+from turbrestore.blur.estimation import BlurCandidate, BlurEstimate, estimate_blur, find_candidates
 from turbrestore.blur.marginal_likelihood import WIDTHS
 from turbrestore.core.arrays import luminance
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve, deconvolve_steps
@@ -39,6 +39,14 @@ def blurred(name, left, right):
     return scene, (image + noise).astype(np.float32), widths.astype(np.float32)
 
 
+@cache
+def estimated(name, left, right):
+    """Widths of the whole image and of its tiles."""
+    _, image, _ = blurred(name, left, right)
+    whole = estimate_blur(image, exponent=2.0)
+    return whole, estimate_blur_map(image, whole)
+
+
 @pytest.fixture(scope="module")
 def brick():
     return blurred("brick", 0.8, 2.2)
@@ -47,7 +55,7 @@ def brick():
 @pytest.mark.long
 def test_a_blur_that_grows_to_the_right_is_found_and_removed(brick):
     scene, image, widths = brick
-    found = estimate_blur_map(image, estimate_blur(image, exponent=2.0))
+    _, found = estimated("brick", 0.8, 2.2)
     assert found.varies
     assert (found.sigmas[:, 1] > 1.4 * found.sigmas[:, 0]).all()
     assert (found.sigmas[:, 1] < 1.3 * 2.2).all()
@@ -60,24 +68,14 @@ def test_a_blur_that_grows_to_the_right_is_found_and_removed(brick):
 
 @pytest.mark.parametrize("name", ["chart", "camera"])
 def test_a_blur_that_is_the_same_everywhere_is_taken_as_one(name):
-    _, image, _ = blurred(name, 1.4, 1.4)
-    assert not estimate_blur_map(image, estimate_blur(image, exponent=2.0)).varies
+    assert not estimated(name, 1.4, 1.4)[1].varies
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("name", "right", "agree"), [("camera", 1.4, True), ("brick", 2.6, False)])
-def test_uncertainties_are_computed_only_if_widths_may_differ(monkeypatch, name, right, agree):
-    _, image, _ = blurred(name, 1.4 if agree else 0.8, right)
-    asked = []
-
-    def counted(*arguments):
-        asked.append(arguments)
-        return choose_blur(*arguments)
-
-    monkeypatch.setattr("turbrestore.blind.blur_map.choose_blur", counted)
-    whole = estimate_blur(image, exponent=2.0)
-    found = estimate_blur_map(image, whole)
-    assert (asked == []) == agree
+@pytest.mark.parametrize(("name", "left", "right", "agree"), [("camera", 1.4, 1.4, True), ("brick", 0.8, 2.2, False)])
+def test_uncertainties_are_computed_only_if_widths_may_differ(monkeypatch, name, left, right, agree):
+    _, image, _ = blurred(name, left, right)
+    whole, found = estimated(name, left, right)
     assert np.isinf(found.uncertainties).all() == agree
     monkeypatch.setattr("turbrestore.blind.blur_map._agree", lambda tiles: False)
     with_uncertainties = estimate_blur_map(image, whole)

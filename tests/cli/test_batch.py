@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-from distributed import CancelledError, KilledWorker, LocalCluster
 
 from conftest import make_sequence
 from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError, TurbrestoreError
@@ -44,6 +43,8 @@ def clips(tmp_path_factory):
 @pytest.fixture(scope="module")
 def scheduler():
     """A scheduler with one worker, both of them threads of this process."""
+    from distributed import LocalCluster
+
     # Any free port: without an address the dashboard takes 8787, which another run of the tests may hold.
     with LocalCluster(
         n_workers=1,
@@ -300,6 +301,8 @@ class TestTiles:
 
     @pytest.mark.parametrize("times", [1, 9])
     def test_a_tile_that_loses_its_process_is_sent_again(self, times):
+        from distributed import CancelledError, KilledWorker
+
         losses = [KilledWorker.__new__(KilledWorker), CancelledError()] * times
 
         class Lossy:

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import QUICK, fails, frames_clip
+from command_line import QUICK, QUICKEST, fails, frames_clip
 
 from conftest import make_sequence
 from turbrestore.io.images import read_image, write_image
@@ -49,7 +49,7 @@ class TestRestore:
     def test_flags_win_over_the_file(self, run, clip, tmp_path):
         config = tmp_path / "run.toml"
         config.write_text('train = 4\n[filter]\nresidual = "drop"\n')
-        assert run("restore", clip, tmp_path / "o.png", "--config", config, "--train", "6", *QUICK)[0] == 0
+        assert run("restore", clip, tmp_path / "o.png", "--config", config, "--train", "6", *QUICKEST)[0] == 0
         settings = tomllib.loads((tmp_path / "o.png.toml").read_text())
         assert settings["train"] == 6
         assert settings["filter"]["residual"] == "drop"
@@ -212,7 +212,7 @@ class TestRestore:
 
     def test_range_and_region(self, run, clip, tmp_path):
         code, out, _ = run(
-            "restore", clip, tmp_path / "o.png", "--frames", "1:7:2", "--roi", "8,4,64,40", "--json", *QUICK
+            "restore", clip, tmp_path / "o.png", "--frames", "1:7:2", "--roi", "8,4,64,40", "--json", *QUICKEST
         )
         assert code == 0
         assert json.loads(out)["frames"] == 3
@@ -221,7 +221,7 @@ class TestRestore:
     def test_sixteen_bits_stay_sixteen_bits(self, run, tmp_path):
         frames = make_sequence(seed=32, count=4, size=64, rms=0.5).frames
         write_video(tmp_path / "deep.mkv", frames, 25, bit_depth=16)
-        assert run("restore", tmp_path / "deep.mkv", tmp_path / "o.png", *QUICK)[0] == 0
+        assert run("restore", tmp_path / "deep.mkv", tmp_path / "o.png", *QUICKEST)[0] == 0
         image = cv2.imread(str(tmp_path / "o.png"), cv2.IMREAD_UNCHANGED)
         assert image.dtype == np.uint16
         assert (image % 257 != 0).any()
@@ -232,18 +232,18 @@ class TestRestore:
         for index, frame in enumerate(make_sequence(seed=33, count=4, size=64, rms=0.5).frames):
             rgba = np.dstack([frame] * 3 + [np.ones_like(frame)])
             cv2.imwrite(str(folder / f"{index}.png"), np.rint(rgba * 255).astype(np.uint8))
-        code, _, err = run("restore", folder, tmp_path / "o.png", *QUICK[:-1])
+        code, _, err = run("restore", folder, tmp_path / "o.png", *QUICKEST[:-1])
         assert code == 0
         assert "alpha" in err
         assert read_image(tmp_path / "o.png").image.shape == (64, 64, 3)
 
     def test_overwrite_is_explicit(self, run, clip, tmp_path):
         output = tmp_path / "o.png"
-        assert run("restore", clip, output, *QUICK)[0] == 0
+        assert run("restore", clip, output, *QUICKEST)[0] == 0
         before = output.read_bytes()
-        fails(run("restore", clip, output, *QUICK), 73, "exists already")
+        fails(run("restore", clip, output, *QUICKEST), 73, "exists already")
         assert output.read_bytes() == before
-        assert run("restore", clip, output, "--overwrite", *QUICK)[0] == 0
+        assert run("restore", clip, output, "--overwrite", *QUICKEST)[0] == 0
 
 
 def test_missing_words_and_unknown_commands(run):
@@ -359,7 +359,7 @@ def test_the_installed_command_answers(tmp_path):
 
 def test_a_smaller_set_of_stages_leaves_none_of_a_larger_one(run, clip, tmp_path):
     keep = tmp_path / "keep"
-    assert run("restore", clip, tmp_path / "a.png", "--keep", keep, *QUICK)[0] == 0
+    assert run("restore", clip, tmp_path / "a.png", "--keep", keep, *QUICKEST)[0] == 0
     assert (
         run("restore", clip, tmp_path / "b.png", "--keep", keep, "--until", "centroid", "--overwrite", *QUICK)[0] == 0
     )

@@ -56,7 +56,7 @@ def smaller(words):
         "restore": QUICK,
         "batch": [*QUICK, "--workers", "1"],
         "deconvolve": STEPS,
-        "synthesize": ["--size", "64x64"],
+        "synthesize": ["--size", "64x64", *([] if "--like" in words else ["--pupil-samples", "24"])],
     }.get(words[0], [])
     blurred = words[0] in ("restore", "deconvolve") and not {"--sigma", "--sweep"} & set(words)
     return [*quick, "--sigma", "1"] if blurred else quick
@@ -237,7 +237,7 @@ def test_no_settings_file_names_a_file_to_write(command):
 
 
 class TestCompletion:
-    def test_script_knows_commands_options_and_values(self, run, folder):
+    def test_script_knows_commands_options_and_values_and_bash_completes(self, run, folder):
         for shell in ("bash", "zsh", "fish"):
             assert run("--install-completion", "--shell", shell, "--output", f"c.{shell}")[0] == 0
             script = Path(f"c.{shell}").read_text()
@@ -246,9 +246,6 @@ class TestCompletion:
         # Files that are named are for the user to load.
         assert not (folder / ".bashrc").exists()
         assert not (folder / ".zshrc").exists()
-
-    def test_bash_completes(self, run, folder):
-        run("--install-completion", "--shell", "bash", "--output", "c.bash")
         line = (
             'source c.bash; COMP_WORDS=(turbrestore res); COMP_CWORD=1; COMP_LINE="turbrestore res"; COMP_POINT=15; '
             '$(complete -p turbrestore | sed "s/.*-F \\([^ ]*\\).*/\\1/"); echo "${COMPREPLY[*]}"'

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import QUICK, fails, frames_clip
+from command_line import QUICKEST, fails, frames_clip
 
 from conftest import make_sequence
 from turbrestore.io.images import write_image
@@ -184,7 +184,7 @@ class TestFilesOfOneRun:
 
     @pytest.mark.parametrize("other", ["o.tif", "./o.tif", "none/../o.tif"])
     def test_outputs_of_restore_differ(self, run, clip, here, other):
-        words = ["restore", clip, "o.tif", "--uncertainty", other, *QUICK]
+        words = ["restore", clip, "o.tif", "--uncertainty", other, *QUICKEST]
         self.refuses(run, here, words, f"{Path(other)}: is named for two outputs")
 
     def test_a_link_is_no_other_output(self, run, clip, here, tmp_path):
@@ -202,7 +202,7 @@ class TestFilesOfOneRun:
         Path("frame.png").write_bytes(here["mask.png"])
         here["frame.png"] = here["mask.png"]
         name = output[0] if len(output) == 1 else "frame.png"
-        self.refuses(run, here, ["restore", clip, *output, "--static-mask", name, *QUICK], name)
+        self.refuses(run, here, ["restore", clip, *output, "--static-mask", name, *QUICKEST], name)
 
 
 def test_errors_name_options_as_they_were_typed(run, clip, tmp_path):

@@ -46,7 +46,7 @@ STATISTICS = [
 @pytest.mark.parametrize("scene", ["chart", "camera"])
 @pytest.mark.parametrize("statistics", STATISTICS, ids=str)
 def test_the_filter_never_ends_worse_than_the_centroid(scene, statistics):
-    sequence = make_sequence(scene=scene, blur_change=1.0, **statistics)
+    sequence = make_sequence(scene=scene, size=72, blur_change=1.0, **statistics)
     centroid, dynamics = start(sequence, len(sequence.frames) // 2)
     filtered = filter_frames(sequence.frames, centroid.image, dynamics, known_flows=centroid.flows)
     assert quality(filtered.image, sequence) >= quality(centroid.image, sequence)
@@ -56,7 +56,7 @@ def test_the_filter_never_ends_worse_than_the_centroid(scene, statistics):
 @pytest.mark.parametrize("statistics", STATISTICS, ids=str)
 def test_where_nothing_can_be_gained_less_than_two_grey_levels_are_lost(scene, statistics):
     """Equally sharp frames, registered almost perfectly: the centroid is within a grey level or two of the truth."""
-    sequence = make_sequence(scene=scene, **statistics)
+    sequence = make_sequence(scene=scene, size=72, **statistics)
     centroid, dynamics = start(sequence, len(sequence.frames) // 2)
     filtered = filter_frames(sequence.frames, centroid.image, dynamics, known_flows=centroid.flows)
     before, after = (10 ** (-quality(image, sequence) / 20) for image in (centroid.image, filtered.image))

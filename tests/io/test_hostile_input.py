@@ -46,7 +46,7 @@ def test_malformed_files_are_refused(run, tmp_path, suffix):
     cases = hostile.malformed((tmp_path / f"whole{suffix}").read_bytes(), suffix)
     for name in ("empty", "magic", "random", "cut010", "cut500", "cut995"):
         (tmp_path / f"{name}{suffix}").write_bytes(cases[name])
-        refused(run("restore", tmp_path / f"{name}{suffix}", tmp_path / "a.result.png"), tmp_path)
+        refused(run("centroid", tmp_path / f"{name}{suffix}", tmp_path / "a.result.npz"), tmp_path)
 
 
 @pytest.mark.parametrize(("kind", "suffix"), hostile.FLIPPED.items())

@@ -1,9 +1,7 @@
 """Arrays that are computed or read on demand: one frame at a time, with the same result as arrays in memory."""
 
-import dask.array as dask_array
 import numpy as np
 import pytest
-import xarray
 
 from turbrestore.io.source import FrameSource
 
@@ -13,6 +11,8 @@ FRAMES = np.random.default_rng(0).random((6, 8, 9, 3), np.float32)
 @pytest.fixture
 def lazy():
     """A Dask array of one frame a chunk, and the numbers of the frames that were computed."""
+    import dask.array as dask_array
+
     computed = []
 
     def load(block_info=None):
@@ -35,6 +35,8 @@ def test_frames_are_computed_when_they_are_read(lazy):
 
 
 def test_labelled_arrays_stay_lazy(lazy):
+    import xarray
+
     array, computed = lazy
     source = FrameSource.from_array(xarray.DataArray(array, dims=("time", "y", "x", "channel")))
     assert computed == [] and source.format == "array/float32"

@@ -18,7 +18,7 @@ from turbrestore.runs.folder_lock import LOCK, lock_folder
 from turbrestore.runs.run_files import RECORD, read_stages
 from turbrestore_cli.__main__ import main
 
-SETTINGS = ["--train=6", "--centroid.iterations=1", "--deconvolution.iterations=2"]
+SETTINGS = ["--train=6", "--centroid.iterations=1", "--sigma=1", "--deconvolution.iterations=2"]
 WORDS = ["restore", "clip.npy", "sharp.png", "--keep=kept", *SETTINGS]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -109,10 +110,17 @@ def describe_run(
 
 def versions() -> dict[str, str]:
     """Versions of turbrestore, Python and the packages that compute."""
-    found = {"turbrestore": __version__, "Python": platform.python_version()}
+    system = f"{platform.system()} {platform.machine()}"
+    return {"turbrestore": __version__, "Python": platform.python_version(), **_package_versions(), "system": system}
+
+
+@functools.cache
+def _package_versions() -> dict[str, str]:
+    """Versions of the packages that compute, each of which is read from a file of metadata."""
+    found = {}
     for name in _PACKAGES:
         try:
             found[name] = version(name)
         except PackageNotFoundError:
             continue
-    return {**found, "system": f"{platform.system()} {platform.machine()}"}
+    return found
