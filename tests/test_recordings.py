@@ -168,6 +168,13 @@ class TestOverlays:
         panned = np.stack([frame[20:120, number : number + 100] for number, frame in enumerate(wide)])
         survey = surveyed(panned)
         assert without_overlay(survey) == (survey, None, None, ())
+        # Beside an overlay they are left alone, too.
+        panned[:, 40:60, 49:51] = panned[:, 49:51, 40:60] = 0
+        clip = without_overlay(surveyed(panned))[0].clip
+        changed = np.abs(clip.read() - panned / np.float32(255)).max(axis=0) > 1e-3
+        assert changed[42:58, 49:51].mean() > 0.9
+        changed[28:72, 28:72] = False
+        assert not changed.any()
 
     def test_a_window_is_that_of_the_whole_frame(self, shaken):
         covered = shaken.copy()
@@ -215,6 +222,14 @@ class TestTitles:
         found = restore(FrameSource.from_array(frames))
         np.testing.assert_allclose(found.image[:6, 50:56], found.mean[:6, 50:56], atol=0.01)
         assert without_overlay(surveyed(plain))[2] is None
+
+    def test_dark_lines_along_the_border_and_still_clips_have_none(self, clip, titled):
+        lined = u8(0.8 * clip.frames)
+        lined[:, :, -2:] = 20
+        assert without_overlay(surveyed(lined))[2] is None
+        noise = np.random.default_rng(1).normal(0, 2, titled.shape)
+        still = np.where(titled[0] == 255, 255, np.clip(titled[0] + noise, 0, 250)).astype(np.uint8)
+        assert without_overlay(surveyed(still))[2] is None
 
     def test_a_quiet_row_of_a_broad_edge_is_no_title(self):
         clear, drawn = np.zeros((2, 60, 60), bool)

@@ -47,17 +47,37 @@ def shaken(truth, rms=0.6, seed=0):
     return [(frame + rng.normal(0, 0.01, frame.shape)).astype(np.float32) for frame in frames]
 
 
-@pytest.mark.parametrize("live", [False, True])
-def test_a_title_keeps_the_pixels_of_its_frame(live):
+@pytest.fixture(scope="module")
+def titled():
+    """Frames with text, and pixels of the strokes."""
     rim, letters = np.zeros((2, SIZE, SIZE), np.uint8)
     for canvas, width in ((rim, 3), (letters, 1)):
         cv2.putText(canvas, "GATE 7", (6, 118), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 255, width)
     frames = [np.where(rim == 255, letters == 255, frame).astype(np.float32) for frame in shaken([0.8 * photo()] * 14)]
-    letters = letters == 255
+    return frames, letters == 255
+
+
+@pytest.mark.parametrize("live", [False, True])
+def test_a_title_keeps_the_pixels_of_its_frame(titled, live):
+    frames, letters = titled
     assert letters.sum() > 20
     for ours, seen in list(zip(images(frames, sigma=0.8, live=live), frames, strict=True))[6:]:
         np.testing.assert_allclose(ours[letters], seen[letters], atol=1e-3)
         assert not np.allclose(ours[:90], seen[:90], atol=1e-3)
+
+
+def test_parts_that_move_later_and_other_scenes_have_no_title(titled):
+    frames, letters = titled
+    # A coder copies a block of the scene until it sends the whole frame again.
+    copied = [frame.copy() for frame in frames]
+    for frame in copied:
+        frame[20:44, 50:74] = frames[0][20:44, 50:74]
+    later = shaken([0.8 * photo()] * 6, seed=1)
+    ours = images([*copied, *later], sigma=0.8)
+    assert not np.allclose(ours[17][20:44, 50:74], later[3][20:44, 50:74], atol=1e-2)
+    other = shaken([0.8 * photo("coins")] * 6, seed=1)
+    ours = images([*frames, *other], sigma=0.8)
+    assert not np.allclose(ours[17][letters], other[3][letters], atol=1e-3)
 
 
 @pytest.mark.long

@@ -64,8 +64,11 @@ _NEAR, _GAP, _FADE = 4, 2, 0.7
 # An edge is drawn over the scene if its deviation is below that of the noise by this factor, or its motion below that
 # of the edges of the scene by this one.
 _NOISELESS, _DRAWN = 0.7, 1 / 8
-# Least share of the clear edges in a title, and of the pixels next to it, that are drawn.
-_LEAST_DRAWN = 1 / 3
+# Least share of the clear edges in a title, and of the pixels next to it, that are drawn; pixels along the border that
+# do not count.
+_LEAST_DRAWN, _BORDER = 1 / 3, 3
+# Share of the edges of a part of a title from which it has moved.
+_MOVED = 0.5
 # Strokes of a clock: largest change of a pixel that stays, in units of the noise and in intensity; least share of the
 # frames that have an edge there, and of these in which it stays; fewest connected pixels.
 _SAME, _LEAST_SAME, _OFTEN, _REMAINS, _FEWEST_STROKES = 1.0, 1.5 / 255, 0.2, 0.25, 12
@@ -112,6 +115,17 @@ class Title:
         mask = self.mask[relative_window(self.window, window)]
         return continued(values, ~mask) if mask.any() else values
 
+    def at_rest(self, frame: FloatArray, noise: float) -> Title | None:
+        """Keep the parts whose edges have not moved: blocks that a coder copies look drawn for a while."""
+        before = luminance(self.frame)
+        gradient = np.hypot(*sobel_gradient(before))
+        edges = self.mask & (gradient > _DEVIATIONS * noise)
+        moved = edges & (np.abs(luminance(frame) - before) > _LEAST_BENDING * gradient)
+        count, labels = cv2.connectedComponents(self.mask.astype(np.uint8), connectivity=8)
+        of_all, gone = (np.bincount(labels[pixels], minlength=count) for pixels in (edges, moved))
+        mask = self.mask & (gone <= _MOVED * of_all)[labels]
+        return replace(self, mask=mask) if mask.any() else None
+
     def put_back(self, image: FloatArray, left: int = 0, top: int = 0) -> FloatArray:
         """Put the title back, with a soft edge, into an image whose first pixel is at (left, top) of the frame."""
         window = np.s_[top : top + len(image), left : left + image.shape[1]]
@@ -153,8 +167,8 @@ def without_overlay(
         moments = moments or measure_moments(survey)
         mask, title = _static_regions(survey.clip, moments)
         if mask is not None:
-            shown = mask if title is None else title.mask
-            mask, title = _with_digits(mask, title, _digits(survey.clip, moments, shown))
+            digits = _digits(survey.clip, moments, mask if title is None else title.mask)
+            mask, title = _with_digits(mask, title, digits)
     if mask is None:
         return survey, None, None, ()
     small = _continued_small(survey.small, mask)
@@ -165,8 +179,11 @@ def without_overlay(
         choice = f"{100 * float(title.mask.mean()):.1f} % of the frame kept as in the mean of the frames"
         reason = "it is static while the air bends the scene around it; it is neither moved nor deblurred"
         return survey.adjusted(title.without, small), title.mask, title, (Decision("overlay", choice, reason),)
-    if moments is not None and not given and _static_regions(survey.clip, moments, shifts)[0] is None:
-        return survey, None, None, ()
+    if moments is not None and not given:
+        mask, _ = _static_regions(survey.clip, moments, shifts)
+        if mask is None:
+            return survey, None, None, ()
+        mask, _ = _with_digits(mask, None, digits & _around(mask, len(mask) // _LINE))
     overlay = _overlay(survey, mask, shifts)
     choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced by what other frames show"
     reason = "asked for" if given else "it is static while the scene moves"
@@ -185,23 +202,23 @@ def _static_regions(
 
     Where ``shifts`` (T, 2) of the camera are known, what lies along its path does not count.
     """
-    mean, usual, deviation = luminance(moments.mean), moments.noise, np.sqrt(moments.variance)
-    floor = max(_STILL * usual, _LEAST_STILL)
+    mean, noise, deviation = luminance(moments.mean), moments.noise, np.sqrt(moments.variance)
+    floor = max(_STILL * noise, _LEAST_STILL)
     still = deviation < floor
     slopes = sobel_gradient(mean)
     gradient = np.hypot(*slopes)
     clear = gradient > _DEVIATIONS / _STILL * floor
-    motion = measured = _motion(deviation[clear], gradient[clear], usual)
+    motion = measured = _motion(deviation[clear], gradient[clear], noise)
     if shifts is not None:
         across = np.einsum("iyx,ij,jyx->yx", slopes, np.cov(shifts.T), slopes)
         motion = np.minimum(measured, np.sqrt(np.maximum(across, 0)) / np.maximum(gradient, 1e-6))
     edges = still & clear & (gradient * np.minimum(_STATIC * motion, 1.0) > deviation)
-    # The camera draws a title over its noise, which no edge of the scene lacks; a coder blurs that again.
-    noiseless = _NOISELESS * max(usual, _LEAST_STILL / _STILL)
+    # A title has no noise of the camera, unless a coder spreads noise over it.
+    noiseless = _NOISELESS * max(noise, _LEAST_STILL / _STILL)
     drawn = _titles(clear & (deviation < np.maximum(_DRAWN * motion * gradient, noiseless)), clear)
     if edges.sum() < _LEAST_EDGES * edges.size and not drawn.any():
         return None, None
-    constant = deviation < _CONSTANT * max(usual, _LEAST_STILL / _STILL)
+    constant = deviation < _CONSTANT * max(noise, _LEAST_STILL / _STILL)
     # A flat part of the scene does not change either; an overlay lacks the noise of the scene, or is dark like a stop.
     black = float(mean.min())
     dark = mean < black + _DARK * (float(np.median(mean[~still])) - black) if (~still).any() else still
@@ -217,15 +234,15 @@ def _static_regions(
 
 
 def _titles(drawn: NDArray[np.bool_], clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Keep drawn pixels in and near regions that have many: in few frames of slow air, other edges hardly move.
+    """Keep drawn pixels in and near regions of many: in few frames of slow air some edges of the scene seem drawn.
 
-    A dark line along the border is no title.
+    A dark line along the border, a pixel or two wide, is no title.
     """
     closed = cv2.morphologyEx(drawn.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((2 * _GAP + 1,) * 2, np.uint8))
     count, labels = cv2.connectedComponents(closed, connectivity=8)
     beside = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8)).astype(int)
     inner = np.zeros_like(drawn)
-    inner[_AROUND:-_AROUND, _AROUND:-_AROUND] = True
+    inner[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
     found, all_edges = (np.bincount(beside[pixels & inner], minlength=count) for pixels in (drawn, clear))
     many = (found >= _FEWEST_STROKES) & (found >= _LEAST_DRAWN * all_edges)
     many[0] = False

@@ -124,12 +124,14 @@ def steady_frames(
     sigma, exponent, witnesses = params.sigma, KOLMOGOROV, None
     if head and sigma is None:
         sigma, exponent, witnesses = _find_first(head[-1], params, runtime)
-    width, title = sigma or 0.0, _find_title(head[-1]) if head else None
+    width = sigma or 0.0
     scenes = _Scenes(params, width, witnesses, runtime)
+    if head:
+        scenes.keep_title(head[-1])
     yield from map_in_turns(
         lambda window: dewarp_frame(window, params),
         lambda frame: (frame, scenes.estimate(frame)),
-        lambda pair: _sharpened(*pair, width, exponent, title),
+        lambda pair: _sharpened(*pair, width, exponent),
         chain(head, windows),
         runtime.threads,
     )
@@ -137,25 +139,17 @@ def steady_frames(
 
 def _one_by_one(windows: Iterable[Window], params: SteadyParams, runtime: Runtime) -> Iterator[SteadyFrame]:
     """Frames of a live stream, each before the next is asked for.  OpenCV shares out what one frame takes."""
-    sigma, exponent, title = params.sigma or 0.0, KOLMOGOROV, None
+    sigma, exponent = params.sigma or 0.0, KOLMOGOROV
     scenes = _Scenes(params, sigma, None, runtime)
     with nullcontext() if runtime.threads != 1 else one_thread_each():
         for window in windows:
             if window.number == params.reach // 2:
-                title = _find_title(window)
+                scenes.keep_title(window)
                 if params.sigma is None:
                     sigma, exponent, witnesses = _find_first(window, params, runtime)
                     scenes.remove(sigma, witnesses)
             frame = dewarp_frame(window, params)
-            yield _sharpened(frame, scenes.estimate(frame), sigma, exponent, title)
-
-
-def _find_title(window: Window) -> Title | None:
-    """Find the title that a static camera has drawn over the frames of a window."""
-    frames = {0: window.frame, **window.neighbours}
-    # A stream is not held to the range that a clip is.
-    stack = np.stack([np.clip(luminance(frames[offset].image), 0, 1) for offset in sorted(frames)])
-    return without_overlay(take_survey(FrameSource.from_array(stack)))[2]
+            yield _sharpened(frame, scenes.estimate(frame), sigma, exponent)
 
 
 def _find_first(window: Window, params: SteadyParams, runtime: Runtime) -> tuple[float, float, BlurWitnesses]:
@@ -196,6 +190,7 @@ class _Scenes:
         self._memory: Memory | None = None
         self._runtime = runtime
         self._found: float | None = None
+        self._title: Title | None = None
         self.remove(sigma, witnesses)
         self._positions: deque[Matrix] = deque(maxlen=LONGEST)
         # From the frame before to the steadied one.
@@ -205,8 +200,16 @@ class _Scenes:
         """Set the width of the blur of frames, and what is known of that of what is remembered if it may be another."""
         self._witnesses, self._first, self._width = witnesses, sigma, sigma
 
-    def estimate(self, frame: DewarpedFrame) -> tuple[Memory, NDArray[np.bool_], float]:
-        """Estimate of the scene at a frame, what moves, and the width of the blur of what is remembered."""
+    def keep_title(self, window: Window) -> None:
+        """Keep the title that a static camera has drawn over the frames of a window of the first scene."""
+        if window.frame.scene == 0:
+            frames = {0: window.frame, **window.neighbours}
+            # A stream is not held to the range that a clip is.
+            stack = np.stack([np.clip(luminance(frames[offset].image), 0, 1) for offset in sorted(frames)])
+            self._title = without_overlay(take_survey(FrameSource.from_array(stack)))[2]
+
+    def estimate(self, frame: DewarpedFrame) -> tuple[Memory, NDArray[np.bool_], float, Title | None]:
+        """Estimate of the scene at a frame, what moves, the width of the blur of what is remembered, and the title."""
         if frame.starts_scene:
             self._memory, self._width, self._found = None, self._first, None
             self._positions.clear()
@@ -221,7 +224,9 @@ class _Scenes:
         estimate = shown(self._memory)
         if self._params.camera == "keep":
             estimate = _checked(estimate, frame, self._steadied)
-        return estimate, moving, self._remembered_width(self._memory)
+        if self._title is not None:
+            self._title = None if frame.seen.scene else self._title.at_rest(frame.seen.image, frame.noise)
+        return estimate, moving, self._remembered_width(self._memory), self._title
 
     def _follow(self, frame: DewarpedFrame) -> tuple[Matrix, Matrix]:
         """Follow the camera: maps from the steadied frame to the one before, and to the dewarped frame."""
@@ -276,13 +281,9 @@ def _placed(image: FloatArray, moving: NDArray[np.bool_], offset: Matrix) -> tup
 
 
 def _sharpened(
-    frame: DewarpedFrame,
-    estimate: tuple[Memory, NDArray[np.bool_], float],
-    sigma: float,
-    exponent: float,
-    title: Title | None,
+    frame: DewarpedFrame, estimate: tuple[Memory, NDArray[np.bool_], float, Title | None], sigma: float, exponent: float
 ) -> SteadyFrame:
-    memory, moving, width = estimate
+    memory, moving, width, title = estimate
     noise = frame.noise * frame.share
     remembered = noise / float(np.sqrt(memory.held.mean()))
     sharp = deblur(memory.image, (sigma, round(width, 2)), exponent, (noise, remembered), memory.held)
