@@ -201,12 +201,11 @@ class _Scenes:
         self._witnesses, self._first, self._width = witnesses, sigma, sigma
 
     def keep_title(self, window: Window) -> None:
-        """Keep the title that a static camera has drawn over the frames of a window of the first scene."""
-        if window.frame.scene == 0:
-            frames = {0: window.frame, **window.neighbours}
-            # A stream is not held to the range that a clip is.
-            stack = np.stack([np.clip(luminance(frames[offset].image), 0, 1) for offset in sorted(frames)])
-            self._title = without_overlay(take_survey(FrameSource.from_array(stack)))[2]
+        """Keep the title that a static camera has drawn over the frames of a window, as long as it is there."""
+        frames = {0: window.frame, **window.neighbours}
+        # A stream is not held to the range that a clip is.
+        stack = np.stack([np.clip(luminance(frames[offset].image), 0, 1) for offset in sorted(frames)])
+        self._title = without_overlay(take_survey(FrameSource.from_array(stack)))[2]
 
     def estimate(self, frame: DewarpedFrame) -> tuple[Memory, NDArray[np.bool_], float, Title | None]:
         """Estimate of the scene at a frame, what moves, the width of the blur of what is remembered, and the title."""
@@ -225,7 +224,7 @@ class _Scenes:
         if self._params.camera == "keep":
             estimate = _checked(estimate, frame, self._steadied)
         if self._title is not None:
-            self._title = None if frame.seen.scene else self._title.at_rest(frame.seen.image, frame.noise)
+            self._title = self._title.at_rest(frame.seen.image, frame.noise)
         return estimate, moving, self._remembered_width(self._memory), self._title
 
     def _follow(self, frame: DewarpedFrame) -> tuple[Matrix, Matrix]:
