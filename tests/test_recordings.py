@@ -105,7 +105,7 @@ def shaken():
 
 
 class TestOverlays:
-    """What stands while the scene moves is no part of the scene."""
+    """What is static while the scene moves is no part of the scene."""
 
     def alike(self, shaken, covered):
         """Signal to noise between results around the middle, in dB."""
@@ -195,7 +195,7 @@ def titled(clip):
 
 
 class TestTitles:
-    """Text that is burnt in while the camera stands keeps its pixels."""
+    """Text that is burnt in keeps its pixels where the camera is static."""
 
     def test_they_stay_as_in_the_mean_and_the_scene_as_without_them(self, clip, titled):
         found, alone = (restore(FrameSource.from_array(some)) for some in (titled, u8(0.8 * clip.frames)))
@@ -240,7 +240,7 @@ class TestTitles:
 
 
 class TestClocks:
-    """Digits that change keep their pixels, although they do not stand all the time."""
+    """Digits that change keep their pixels, although they are not static all the time."""
 
     def test_they_stay_as_in_the_mean(self, clip):
         frames = u8(0.8 * clip.frames)

@@ -10,7 +10,7 @@ import pytest
 from turbrestore.blind.blur_map import _like, blur_map_steps, estimate_blur_map, sigma_map, varying_deconvolution_steps
 from turbrestore.blind.guards import GuardParams
 from turbrestore.blind.remove_blur import remove_blur
-from turbrestore.blur.estimation import BlurCandidate, BlurEstimate, estimate_blur, find_candidates
+from turbrestore.blur.estimation import BlurCandidate, BlurEstimate, choose_blur, estimate_blur, find_candidates
 from turbrestore.blur.marginal_likelihood import WIDTHS
 from turbrestore.core.arrays import luminance
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve, deconvolve_steps
@@ -75,7 +75,13 @@ def test_a_blur_that_is_the_same_everywhere_is_taken_as_one(name):
 @pytest.mark.parametrize(("name", "left", "right", "agree"), [("camera", 1.4, 1.4, True), ("brick", 0.8, 2.2, False)])
 def test_uncertainties_are_computed_only_if_widths_may_differ(monkeypatch, name, left, right, agree):
     _, image, _ = blurred(name, left, right)
-    whole, found = estimated(name, left, right)
+    whole, _ = estimated(name, left, right)
+    asked = []
+    monkeypatch.setattr(
+        "turbrestore.blind.blur_map.choose_blur", lambda *words: asked.append(words) or choose_blur(*words)
+    )
+    found = estimate_blur_map(image, whole)
+    assert (asked == []) == agree
     assert np.isinf(found.uncertainties).all() == agree
     monkeypatch.setattr("turbrestore.blind.blur_map._agree", lambda tiles: False)
     with_uncertainties = estimate_blur_map(image, whole)

@@ -161,7 +161,10 @@ def test_what_a_page_prints_runs(page, folder, frames, capsys):
 
 
 def test_the_pages_have_commands():
-    assert sum(len(commands(page)) for page in PAGES) > 40
+    found = [command for page in PAGES for command in commands(page)]
+    assert len(found) > 40
+    # The one whose report is made.
+    assert any(command.endswith("--report chart.html") for command in found)
 
 
 def test_extras_that_pages_name_exist():

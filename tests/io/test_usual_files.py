@@ -47,7 +47,7 @@ class TestCounts:
         np.save(tmp_path / "a.npy", counts)
         source = open_frames(tmp_path / "a.npy")
         assert source.levels[0] == 0 and 2900 < source.levels[1] <= 3000
-        assert source.warnings[0].endswith("and the few values beyond, which stand alone, are clipped")
+        assert source.warnings[0].endswith("and the few values beyond, which are isolated, are clipped")
         assert source.read().max() == 1
 
     def test_stars_are_no_lone_values(self):

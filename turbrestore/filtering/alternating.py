@@ -241,10 +241,8 @@ def _advance_image(
     image: PixelStacks, tracked: TrackedFrame, settings: PassSettings
 ) -> tuple[PixelStacks, FrameRecord]:
     """Predict the image (eq. 14), and update it by a frame that counts (eqs. 15, 16)."""
-    frame, predicted = (
-        tracked.registered or register(tracked, settings),
-        predict_image(image, settings.params.image_drift),
-    )
+    frame = tracked.registered or register(tracked, settings)
+    predicted = predict_image(image, settings.params.image_drift)
     if frame is None:
         return predicted, FrameRecord(tracked.state.mean, 0.0, tracked.innovation, np.nan, 0.0)
     image, gains = update_image(predicted, frame.channels, frame.noise)

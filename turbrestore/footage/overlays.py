@@ -42,7 +42,7 @@ from .survey import Moments, Survey, measure_moments
 
 # Fewest and most frames of a clip in which an overlay is looked for.
 FEWEST, _MOST = 3, 1500
-# Root mean square of the shifts from which a scene moves, pixels.
+# Root mean square of the shifts of the camera, pixels, from which the scene counts as moving.
 _LEAST_MOTION = 3.0
 # An edge is static if it varies by less than its gradient times this share of the motion of the edges, or one pixel,
 # and if its gradient is that many times the noise; with a static camera, the edges move by at least so many pixels.
@@ -67,8 +67,8 @@ _NOISELESS, _DRAWN = 0.7, 1 / 8
 # Least share of the clear edges in a title, and of the pixels next to it, that are drawn; pixels along the border that
 # do not count.
 _LEAST_DRAWN, _BORDER = 1 / 3, 3
-# Share of the edges of a part of a title from which it has moved.
-_MOVED = 0.5
+# A part of a title has moved if edges with this share of its squared gradients are so many pixels from where they were.
+_MOVED, _MOTION = 0.5, 0.5
 # Strokes of a clock: largest change of a pixel that stays, in units of the noise and in intensity; least share of the
 # frames that have an edge there, and of these in which it stays; fewest connected pixels.
 _SAME, _LEAST_SAME, _OFTEN, _REMAINS, _FEWEST_STROKES = 1.0, 1.5 / 255, 0.2, 0.25, 12
@@ -120,9 +120,9 @@ class Title:
         before = luminance(self.frame)
         gradient = np.hypot(*sobel_gradient(before))
         edges = self.mask & (gradient > _DEVIATIONS * noise)
-        moved = edges & (np.abs(luminance(frame) - before) > _LEAST_BENDING * gradient)
+        moved = edges & (np.abs(luminance(frame) - before) > _MOTION * gradient)
         count, labels = cv2.connectedComponents(self.mask.astype(np.uint8), connectivity=8)
-        of_all, gone = (np.bincount(labels[pixels], minlength=count) for pixels in (edges, moved))
+        of_all, gone = (np.bincount(labels[pixels], gradient[pixels] ** 2, count) for pixels in (edges, moved))
         mask = self.mask & (gone <= _MOVED * of_all)[labels]
         return replace(self, mask=mask) if mask.any() else None
 

@@ -52,7 +52,7 @@ class CountRange:
             f"values {self.lowest:g} to {self.highest:g} are scaled: {self.black:g} is black, {self.white:g} is white"
         )
         clipped = self.lowest < self.black or self.highest > self.white
-        return text + (", and the few values beyond, which stand alone, are clipped" if clipped else "")
+        return text + (", and the few values beyond, which are isolated, are clipped" if clipped else "")
 
     def unit(self, values: PixelArray) -> FloatArray:
         """Bring numbers to intensities; NaN and infinite ones stay."""

@@ -228,9 +228,9 @@ def _page_pixels(name: str, page: tifffile.TiffPage, limits: Limits) -> PixelArr
 
 def _parts(name: str, page: tifffile.TiffPage) -> list[tuple[int, int]]:
     """Offset and size of every strip or tile of a page; tifffile would make those up that have no bytes in the file."""
-    parts, end = list(zip(page.dataoffsets, page.databytecounts, strict=True)), page.parent.filehandle.size
-    expected = math.prod(page.chunked)
-    missing = expected - sum(0 < offset < end and size > 0 for offset, size in parts[:expected])
+    expected, end = math.prod(page.chunked), page.parent.filehandle.size
+    parts = list(zip(page.dataoffsets, page.databytecounts, strict=True))[:expected]
+    missing = expected - sum(0 < offset < end and size > 0 for offset, size in parts)
     if missing:
         problem = f"expected pixels in all strips and tiles, found none in {missing} of {expected}"
         raise DataError(f"{name}: {problem}; copy the file again")
