@@ -228,9 +228,8 @@ def _static_regions(
     mask = _around(mask, _AROUND)
     if not drawn.any() or measured < _LEAST_BENDING:
         return mask, None
-    letters = _regions((constant & _around(drawn, _NEAR)) | drawn, drawn).astype(np.uint8)
-    letters = cv2.morphologyEx(letters, cv2.MORPH_CLOSE, np.ones((2 * _GAP + 1,) * 2, np.uint8))
-    return mask, Title(_around(letters, 1), moments.mean, source.window)
+    letters = _with_gaps(_regions((constant & _around(drawn, _NEAR)) | drawn, drawn))
+    return mask, Title(_around(letters > 0, 1), moments.mean, source.window)
 
 
 def _titles(drawn: NDArray[np.bool_], clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -238,8 +237,7 @@ def _titles(drawn: NDArray[np.bool_], clear: NDArray[np.bool_]) -> NDArray[np.bo
 
     A dark line along the border, a pixel or two wide, is no title.
     """
-    closed = cv2.morphologyEx(drawn.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((2 * _GAP + 1,) * 2, np.uint8))
-    count, labels = cv2.connectedComponents(closed, connectivity=8)
+    count, labels = cv2.connectedComponents(_with_gaps(drawn), connectivity=8)
     beside = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8)).astype(int)
     inner = np.zeros_like(drawn)
     inner[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
@@ -279,8 +277,13 @@ def _digits(source: FrameSource, moments: Moments, mask: NDArray[np.bool_]) -> N
 
 def _large(strokes: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Regions of many strokes, with the gaps between them."""
+    return _regions(_with_gaps(strokes), strokes, _FEWEST_STROKES)
+
+
+def _with_gaps(strokes: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Add the gaps between strokes, 0 or 1."""
     closed = cv2.morphologyEx(strokes.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((2 * _GAP + 1,) * 2, np.uint8))
-    return _regions(closed, strokes, _FEWEST_STROKES)
+    return np.asarray(closed, np.uint8)
 
 
 def _with_digits(
