@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 import skimage.data
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, given, settings
+from hypothesis.strategies import none
 
 from turbrestore.core.arrays import luminance
 from turbrestore.footage.survey import Survey, take_survey
@@ -46,6 +47,8 @@ def pytest_collection():
     """Leave out of the searches for cycles what is imported for good: each would pass through millions of objects."""
     gc.disable()
     result = yield
+    # The first test that Hypothesis runs registers a generator, and searches what is not frozen for a reference to it.
+    given(none())(lambda _: None)()
     gc.freeze()
     gc.enable()
     return result
