@@ -76,7 +76,8 @@ class SaveView:
                 tab.apply()
             while tab.busy:
                 await asyncio.sleep(_BEAT)
-            if tab.pending:
+            # Another clip may have been opened meanwhile.
+            if tab.pending or tab.restored is None:
                 self._note.text = "Nothing was saved."
                 return
             written = await asyncio.to_thread(save, tab.restored, outputs, clip.name, Path(self._path.value or ""))

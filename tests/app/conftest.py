@@ -135,7 +135,7 @@ def open_another(page, name, frames):
     """Open another clip of the list, which has so many frames."""
     press(page, "Another clip")
     press(page, name)
-    page.get_by_text(f"{frames} frames").first.wait_for()
+    page.locator(".sum").get_by_text(f", {frames} frames").wait_for()
 
 
 def drop(page, name, data):

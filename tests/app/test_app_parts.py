@@ -253,6 +253,16 @@ class TestTab:
         assert ended(job).state in ("stopped", "done")
         assert (tab.restored, tab.job) == (None, None)
 
+    def test_nothing_can_be_run_while_a_clip_is_read(self, folder, monkeypatch):
+        tab, busy = Tab(Folders(folder)), []
+        monkeypatch.setattr("turbrestore_app.tab.open_clip", lambda *_: busy.append(tab.busy))
+        tab.open(folder / "clip.mkv")
+        assert (busy, tab.busy) == ([True], False)
+        monkeypatch.undo()
+        with pytest.raises(DataError):
+            tab.open(folder / "notes.txt")
+        assert not tab.busy
+
 
 class TestSeveral:
     @pytest.fixture
