@@ -4,6 +4,7 @@
 defect                criterion                                                          :func:`clean_source`
 ====================  =================================================================  =============================
 NaN, infinite values  in up to 1 % of a frame; more raises DataError                     fills them from around
+black borders         black in some frames along most of three sides                     shows what others do
 stuck pixels          outside the range of their neighbours in every frame               median of the neighbours
 duplicated frames     every value equals that of the frame before                        leaves them out
 blank frames          a tenth of the usual contrast or less: lens cap, flash, dropout    leaves them out
@@ -12,7 +13,7 @@ saturation            half of the values or more are white                      
 ====================  =================================================================  =============================
 
 :func:`without_blank` finds blank frames alone, and leaves them out.
-:mod:`turbrestore.footage.checks.scene_cuts` detects cuts, :mod:`turbrestore.footage.checks.stuck_pixels` stuck pixels.
+Each of scene_cuts, stuck_pixels, repeats, black_borders and missing_pixels, beside this module, describes one of them.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from ...core.decision import Decision
 from ...core.errors import ConfigurationError, DataError, require_between
 from ...io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
 from ...io.source import FrameSource, numbers_text
+from .black_borders import BlackBorderDetector
 from .missing_pixels import FEW_MISSING, MOST_MISSING, Backdrop, fill_holes, mean_backdrop
 from .repeats import RepeatDetector
 from .scene_cuts import Scene, SceneDetector, group_scenes, thumbnail
@@ -102,7 +104,8 @@ class ContentReport:
     warnings : tuple of str
         The defects and what is done about them; empty for a clean video.
     backdrop : Backdrop or None
-        What frames show behind pixels that others lack; None where no frame lacks more than a hundredth.
+        What frames show behind pixels that others lack; None where no frame lacks more than a hundredth, or has black
+        borders.
     """
 
     numbers: range | tuple[int, ...]
@@ -142,7 +145,7 @@ def check_content(source: FrameSource, params: ContentParams | None = None) -> C
     for number, pixels, mosaic in zip(source.numbers, source.native(), source.mosaics(), strict=True):
         scan.update(number, pixels, mosaic)
     report = scan.report()
-    if params.strict and (report.left_out or report.filled or len(report.stuck)):
+    if params.strict and (report.left_out or report.filled or report.backdrop is not None or len(report.stuck)):
         raise DataError(f"{source.name}: {report.warnings[0]}; refused by strict, leave it out to go on")
     return report
 
@@ -169,8 +172,8 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
     if report.numbers != source.numbers:
         raise ConfigurationError(f"{source.name}: the report is about other frames; check this selection")
     cleaned = source.without(report.left_out, "")
-    fill, stuck, before = bool(report.filled), report.stuck, source.repair
     backdrop = None if report.backdrop is None else _of_file(report.backdrop, source)
+    fill, stuck, before = bool(report.filled) or backdrop is not None, report.stuck, source.repair
 
     def repaired(pixels: PixelArray) -> PixelArray:
         pixels = pixels if before is None else before(pixels)
@@ -193,7 +196,7 @@ def _of_file(backdrop: Backdrop, source: FrameSource) -> Backdrop:
     values = np.zeros(source.file_shape[1:], np.float32)
     unseen = np.zeros(source.file_shape[1:3], bool)
     values[source.window], unseen[source.window] = backdrop.values, backdrop.unseen
-    return Backdrop(values, unseen)
+    return dataclasses.replace(backdrop, values=values, unseen=unseen)
 
 
 def without_blank(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
@@ -207,7 +210,13 @@ def without_blank(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...
 
 def keep_all(report: ContentReport) -> ContentReport:
     """Return the report for a use that keeps every frame: defects are repaired, and nothing is left out."""
-    kept = dataclasses.replace(report, blank=(), duplicated=(), scenes=report.scenes[:1], left_out=frozenset())
+    backdrop = report.backdrop
+    if backdrop is not None and len(report.scenes) > 1:
+        # Other scenes stand before another backdrop.
+        backdrop = dataclasses.replace(backdrop, black_borders=False)
+    kept = dataclasses.replace(
+        report, blank=(), duplicated=(), scenes=report.scenes[:1], left_out=frozenset(), backdrop=backdrop
+    )
     return dataclasses.replace(kept, warnings=tuple(_in_words(kept, False)))
 
 
@@ -225,6 +234,7 @@ class _ContentScan:
         self._duplicated: list[int] = []
         self._repeats = RepeatDetector()
         self._needs_backdrop = False
+        self._borders = BlackBorderDetector()
         self._stuck = StuckPixelDetector(params.stuck_excess)
         self._scenes = SceneDetector(params.cut_similarity)
 
@@ -241,6 +251,8 @@ class _ContentScan:
         self._contrasts.append(contrast)
         # A running estimate of the median, because blank frames must reach neither the scenes nor the stuck pixels.
         self._usual += 0.1 * (max(contrast, _LEAST_CONTRAST) - self._usual) if self._usual else contrast
+        if mosaic is None:
+            self._borders.update(pixels)
         if contrast > max(_LEAST_CONTRAST, self._params.blank_contrast * self._usual):
             # Stuck pixels are isolated in the mosaic; interpolation of colours spreads them.
             self._stuck.update(values if mosaic is None else self._planes(mosaic))
@@ -266,8 +278,11 @@ class _ContentScan:
         else:
             stuck[:, 0] += rows.start
             stuck[:, 1] += columns.start
-        # Frames are read again, as few clips lack so much.
-        needed, shape = self._needs_backdrop, self._source.shape[1:]
+        backdrop, borders = None, self._borders.found()
+        if self._needs_backdrop or borders:
+            # Frames that are used are read again, as few clips lack so much.
+            frames = self._source.without(numbers[left_out].tolist(), "").native()
+            backdrop = mean_backdrop(frames, self._source.shape[1:], borders)
         report = ContentReport(
             numbers=self._source.numbers,
             filled=tuple(self._filled),
@@ -280,7 +295,7 @@ class _ContentScan:
             contrast=float(contrasts.max()),
             left_out=frozenset(numbers[left_out].tolist()),
             warnings=(),
-            backdrop=mean_backdrop(self._source.native(), shape) if needed else None,
+            backdrop=backdrop,
         )
         return dataclasses.replace(report, warnings=tuple(_in_words(report, bool(repeated))))
 
@@ -318,6 +333,8 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
         where = numbers_text(report.filled)
         how = "from around" if report.backdrop is None else _how_filled(report)
         lines.append(f"{report.filled_values} NaN or infinite {values} in {where}: filled {how}")
+    if report.backdrop is not None and report.backdrop.black_borders:
+        lines.append("black borders that change from frame to frame: filled by what other frames show")
     if len(report.stuck):
         places = "; ".join(f"x {place[1]}, y {place[0]}" for place in report.stuck[:3])
         lines.append(

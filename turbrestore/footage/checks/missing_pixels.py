@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray
 from ...io.pixels import PixelArray
+from .black_borders import black_border
 
 # Share of a frame that may be missing and is filled from around, and from which the frame shows too little.
 FEW_MISSING, MOST_MISSING = 0.01, 0.5
@@ -47,28 +48,41 @@ class Backdrop:
     # (H, W) or (H, W, 3): mean over the frames that have a value; where none has one, that of the pixels around.
     values: FloatArray
     unseen: NDArray[np.bool_]  # (H, W): pixels that no frame has
+    black_borders: bool  # whether frames lack what is black along their borders, too
 
     def behind(self, pixels: PixelArray) -> PixelArray:
-        """Fill a few missing pixels from around, many from what other frames show."""
-        missing = ~np.isfinite(pixels)
-        if np.count_nonzero(missing) <= FEW_MISSING * pixels.size:
-            return fill_holes(pixels)
-        return np.where(missing, self.values, pixels).astype(np.float32)
+        """Fill a few missing pixels from around, many and black borders from what other frames show."""
+        if np.count_nonzero(~np.isfinite(pixels)) <= FEW_MISSING * pixels.size:
+            pixels = fill_holes(pixels)
+        missing = _missing(pixels, self.black_borders)
+        if not missing.any():
+            return pixels
+        if np.issubdtype(pixels.dtype, np.floating):
+            return np.where(missing, self.values, pixels).astype(np.float32)
+        return np.where(missing, np.rint(self.values), pixels).astype(pixels.dtype)
 
 
-def mean_backdrop(frames: Iterable[PixelArray], shape: tuple[int, ...]) -> Backdrop:
-    """Average what frames show, and continue it smoothly to where none shows anything.
+def mean_backdrop(frames: Iterable[PixelArray], shape: tuple[int, ...], black_borders: bool) -> Backdrop:
+    """Average what frames show, and continue it smoothly to where none has a value.
 
-    ``frames`` (H, W) or (H, W, 3) each, as ``shape`` says; missing pixels are NaN or infinite.
+    ``frames`` (H, W) or (H, W, 3) each, as ``shape`` says; missing pixels are NaN, infinite or, with ``black_borders``,
+    black.  What is black in every frame stays so: it may be part of the scene.
     """
-    total, count = np.zeros(shape), np.zeros(shape, np.int64)
+    total, count, valued = np.zeros(shape), np.zeros(shape, np.int64), np.zeros(shape, bool)
     for pixels in frames:
-        known = np.isfinite(pixels)
+        known = ~_missing(pixels, black_borders)
         total[known] += pixels[known]
         count += known
-    known = count > 0
+        valued |= np.isfinite(pixels)
     mean = (total / np.maximum(count, 1)).astype(np.float32)
-    return Backdrop(continued(mean, known), np.asarray(~known if known.ndim == 2 else ~known.all(axis=2)))
+    unseen = np.asarray(~valued if valued.ndim == 2 else ~valued.all(axis=2))
+    return Backdrop(continued(mean, valued), unseen, black_borders)
+
+
+def _missing(pixels: PixelArray, black_borders: bool) -> NDArray[np.bool_]:
+    """Mark what a frame lacks; of the shape of the frame."""
+    missing = ~np.isfinite(pixels)
+    return np.asarray((missing.T | black_border(pixels).T).T) if black_borders else missing
 
 
 def continued(values: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
