@@ -64,6 +64,11 @@ class TestStabilised:
             black = ~one[often]
             np.testing.assert_allclose(frame[often][black], mean[black], atol=0.51 / 255 if white != 1 else 1e-5)
 
+    def test_a_black_part_of_the_scene_beside_a_border(self, whole, shown):
+        stack = np.where(shown, whole, 0).astype(np.uint8)
+        stack[:, -18:, -18:] = 0
+        assert check_content(FrameSource.from_array(stack)).backdrop is not None
+
     def test_what_is_black_in_every_frame_stays(self, whole, shown):
         stack = np.where(shown, whole, 0).astype(np.uint8)
         stack[:, 30:40, :20] = 0
@@ -103,8 +108,10 @@ class TestNoBorder:
     @pytest.mark.parametrize("radius", [0.5, 0.8, 1.0, 1.2, 1.5])
     @pytest.mark.parametrize("size", [0.05, 0.15, 0.4])
     def test_a_planet_that_the_wind_shakes(self, radius, size):
-        discs = [radius * SIDE / 2 - np.hypot(X - x, Y - y) for x, y, _ in shakes(2, size * SIDE)]
-        stack = np.uint8(np.clip(np.array(discs) / 2, 0, 1) * (150 + 50 * np.sin(X / 4) * np.sin(Y / 3)))
+        side = 120
+        y, x = np.mgrid[:side, :side] - (side - 1) / 2
+        discs = [radius * side / 2 - np.hypot(x - right, y - down) for right, down, _ in shakes(2, size * side)]
+        stack = np.uint8(np.clip(np.array(discs) / 2, 0, 1) * (150 + 50 * np.sin(x / 4) * np.sin(y / 3)))
         assert check_content(FrameSource.from_array(stack)).backdrop is None
 
     def test_a_sky_of_noise_around_zero(self):

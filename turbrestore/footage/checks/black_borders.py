@@ -19,9 +19,9 @@ _BLACK_OF_CODEC, _DARKENED = 4, 3
 _NARROWEST, _AT_TIMES, _FEWEST = 3, 0.02, 2
 # Least share of a side that is black in such a frame, and that is black at times, and least number of such sides.
 _OF_SIDE, _SIDES = 0.5, 3
-# Largest distance of the edge of a border from a line, pixels, least share of its length that is so close, and least
-# share of the borders that have such an edge.
-_OFF_LINE, _STRAIGHT, _MOST_STRAIGHT = 2.0, 0.8, 0.5
+# Largest distance of the edge of a border from a line, pixels, most of its length that lies beyond, as where the scene
+# is black, and before the line, as the middle of an arc; least share of the borders whose edge is a line.
+_OFF_LINE, _MOST_BEYOND, _MOST_BEFORE, _MOST_STRAIGHT = 2.0, 0.35, 0.05, 0.5
 # Most of a frame that may be black: one without a picture has no border.
 _MOST = 0.5
 
@@ -77,13 +77,17 @@ def _is_straight(shown: NDArray[np.bool_]) -> bool | None:
     if not len(places):
         return None
     widths = shown.argmax(axis=0)[places]
-    # The line passes through the medians of the first and of the last third, as corners belong to other borders.
     third = -(-len(places) // 3)
-    (left, first), (right, last) = (
-        (np.median(places[part]), np.median(widths[part])) for part in (slice(third), slice(-third, None))
-    )
-    line = first + (places - left) * (last - first) / max(right - left, 1)
-    return bool(np.mean(np.abs(widths - line) <= _OFF_LINE) >= _STRAIGHT)
+    left, right = (_narrow(places[part], widths[part]) for part in (slice(third), slice(-third, None)))
+    line = left[1] + (places - left[0]) * (right[1] - left[1]) / max(right[0] - left[0], 1)
+    beyond, before = np.mean(widths - line > _OFF_LINE), np.mean(line - widths > _OFF_LINE)
+    return bool(beyond <= _MOST_BEYOND and before <= _MOST_BEFORE)
+
+
+def _narrow(places: NDArray[np.int64], widths: NDArray[np.int64]) -> tuple[int, int]:
+    """Place and width where the border is narrower than nearly everywhere: dark parts of the scene widen it."""
+    chosen = np.argsort(widths, kind="stable")[len(widths) // 4]
+    return int(places[chosen]), int(widths[chosen])
 
 
 def _level(pixels: PixelArray) -> PixelArray:
