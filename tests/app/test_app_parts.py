@@ -347,7 +347,7 @@ def test_only_the_newest_pictures_are_kept():
 
 
 def test_pages_of_one_tab_leave_in_any_order(monkeypatch, tmp_path):
-    from nicegui import ui
+    from nicegui import app, ui
 
     from turbrestore_app import server
     from turbrestore_app.views import page
@@ -355,18 +355,29 @@ def test_pages_of_one_tab_leave_in_any_order(monkeypatch, tmp_path):
     async def nothing(*_):
         """Stand in for what needs a browser."""
 
-    left = []
-
-    def show(client_id):
-        client = SimpleNamespace(tab_id="tab", id=client_id, connected=nothing, on_delete=left.append)
-        monkeypatch.setattr(ui, "context", SimpleNamespace(client=client))
-        asyncio.run(server._show(shown, tabs, Folders(tmp_path), None))
-
-    shown, tabs = {}, set()
+    shown, tabs, left, on_their_way = {}, set(), [], []
     monkeypatch.setattr(page, "add_styles_and_scripts", lambda: None)
     monkeypatch.setattr(page, "Page", lambda _: SimpleNamespace(show=nothing))
-    show("first")
-    show("second")
-    for leave in reversed(left):
-        leave()
-    assert not shown and not tabs
+    monkeypatch.setattr(app, "clients", lambda _: on_their_way)
+
+    async def show(client_id):
+        client = SimpleNamespace(tab_id="tab", id=client_id, connected=nothing, on_delete=left.append)
+        monkeypatch.setattr(ui, "context", SimpleNamespace(client=client))
+        await server._show(shown, tabs, Folders(tmp_path), None)
+
+    async def come_and_leave():
+        await show("first")
+        before = set(tabs)
+        on_their_way.append(SimpleNamespace(has_socket_connection=False))
+        leaving = asyncio.create_task(left[0]())
+        await asyncio.sleep(0)
+        await show("second")
+        on_their_way.clear()
+        await leaving
+        # A page that is loaded slowly finds its tab again.
+        assert tabs == before
+        for leave in reversed(left):
+            await leave()
+        assert not shown and not tabs
+
+    asyncio.run(come_and_leave())
