@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -18,7 +17,7 @@ from ..restoring import Restored
 from ..tab import Tab
 from .clip_view import ClipView
 from .compare_view import CompareView
-from .elements import Notices
+from .elements import Notices, in_thread
 from .live_view import LiveView
 from .open_view import OpenView
 from .run_view import RunView
@@ -81,7 +80,7 @@ class Page:
         """Open a clip that is allowed, and show it."""
         with self.notices.catching():
             with self.notices.waiting(f"Reading {path.name} …"):
-                clip = await asyncio.to_thread(self.tab.open, path)
+                clip = await in_thread(self.tab.open, path)
             self.compare_view.clear()
             self.sweep_view.clear()
             self.video_view.fill()
