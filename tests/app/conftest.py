@@ -39,7 +39,7 @@ class App:
     def ask(self, path="", method="GET", **headers):
         """Status of the answer to a request."""
         parts = urlsplit(self.address)
-        connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=10)
+        connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=60)
         connection.putrequest(method, path or parts.path, skip_host="Host" in headers)
         for name, value in headers.items():
             connection.putheader(name.replace("_", "-"), value)
@@ -65,7 +65,7 @@ def app(tmp_path_factory):
     yield app
     if app.process.poll() is None:
         app.process.send_signal(signal.SIGINT)
-    _, complaints = app.process.communicate(timeout=20)
+    _, complaints = app.process.communicate(timeout=60)
     # A bug would have left its traceback.
     assert (app.process.returncode, complaints) == (130, "turbrestore: interrupted\n")
     assert list(temporary.iterdir()) == []
@@ -83,7 +83,7 @@ def window(browser, app):
 
 def load(page, app):
     page.goto(app.address)
-    page.locator("#frame img").wait_for()
+    page.wait_for_function("document.querySelector('#frame img')?.naturalWidth > 0")
     page.locator("svg.quality").wait_for(state="attached")
 
 
@@ -136,6 +136,12 @@ def open_another(page, name, frames):
     press(page, "Another clip")
     press(page, name)
     page.locator(".sum").get_by_text(f", {frames} frames").wait_for()
+
+
+def wait_for_result(page, words):
+    """Wait for the first result of a page, and for the width of its blur and its command, which come after it."""
+    page.get_by_text(words).wait_for(timeout=LONG)
+    page.locator(".value").get_by_text(" px").wait_for()
 
 
 def drop(page, name, data):
