@@ -164,7 +164,7 @@ class ClipView:
             while self._shown != self._wanted:
                 number = self._wanted
                 image = await in_thread(clip.frame, number)
-                self._image.set_source(await in_thread(self._tab.pictures.put, image, self._levels))
+                self._image.set_source(await in_thread(self._tab.pictures.put, image, self._levels, "frame"))
                 self._shown = number
         except Exception as error:
             self._notices.tell(one_line(error))

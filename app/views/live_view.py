@@ -64,7 +64,7 @@ class LiveView:
             return
         self._shown = newest
         for words, picture in self._pictures.items():
-            address = await in_thread(self._tab.pictures.put, job.images[words])
+            address = await in_thread(self._tab.pictures.put, job.images[words], (0.0, 1.0), "live")
             picture.content = f'<img src="{address}" alt="{words}" style="width: 100%">'
 
     def _start(self) -> None:

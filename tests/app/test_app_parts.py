@@ -339,11 +339,12 @@ def test_examples(module):
     assert doctest.testmod(module).failed == 0
 
 
-def test_only_the_newest_pictures_are_kept():
+def test_only_the_newest_pictures_of_each_kind_are_kept():
     pictures = Pictures("pictures/key")
-    addresses = [pictures.put(np.zeros((4, 4), np.float32)) for _ in range(30)]
+    image = np.zeros((4, 4), np.float32)
+    addresses = [pictures.put(image) for _ in range(20)] + [pictures.put(image, kind="frame") for _ in range(20)]
     found = [pictures.get(address.rpartition("/")[2]) is not None for address in addresses]
-    assert found == [False] * 6 + [True] * 24
+    assert found == ([False] * 4 + [True] * 16) * 2
 
 
 def test_pages_of_one_tab_leave_in_any_order(monkeypatch, tmp_path):
