@@ -201,7 +201,8 @@ class TuneView:
         rounds = 2 if params.method in SLOW else 1
         for count in range(1, rounds + 1):
             image = await in_thread(next, images, None)
-            if image is None:
+            # Another clip may have been opened, or another result made.
+            if image is None or restored is not self._tab.restored:
                 return
             note = self._words(image, time.perf_counter() - begun, count < rounds)
             await self._compare.show_part(restored, part, image, note)
