@@ -209,13 +209,14 @@ class Page:
     async def _show_images(self) -> None:
         """Show the images of the stages that are done."""
         job = self.tab.job
-        if job is None or job.kind == "live" or job.state != "running" or not job.images:
+        if job is None or job.kind == "live" or job.state != "running":
             return
-        shown = len(job.images)
-        if self._seen != (job, shown):
-            self._seen = job, shown
+        # A copy: the next of several clips begins with none.
+        images = dict(job.images)
+        if images and self._seen != (job, len(images)):
+            self._seen = job, len(images)
             with self.notices.catching():
-                await self.compare_view.show(dict(job.images), "The stages that are done so far.")
+                await self.compare_view.show(images, "The stages that are done so far.")
             self._refresh()
 
 
