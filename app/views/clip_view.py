@@ -86,7 +86,6 @@ class ClipView:
         self._shown = -1
         self._scrubber.value = middle
         await self._show(middle)
-        self.draw(None)
         await self._fill_strip(clip)
 
     async def _fill_strip(self, clip: Clip) -> None:

@@ -107,6 +107,9 @@ class Page:
     async def _opened(self, clip: Clip) -> None:
         self.notices.name(clip.name)
         self.open_view.opened()
+        self.run_view.opened()
+        if self.tab.restored is not None:
+            self.run_view.take_over(self.tab.restored.order)
         self.save_view.opened()
         self.tune_view.opened()
         self.steady_view.opened()
@@ -114,7 +117,7 @@ class Page:
         self.look_at("clip")
         self._refresh()
         await self.clip_view.opened()
-        await self.run_view.opened()
+        await self.run_view.measure()
 
     async def _go_on(self) -> None:
         """Show again what a page that was loaded anew had open; a run that is running or has ended is followed."""
@@ -123,7 +126,6 @@ class Page:
         with self.notices.catching():
             await self._opened(clip)
             if restored is not None:
-                self.run_view.take_over(restored.order)
                 await self.compare_view.show_result(restored)
                 await self.tune_view.restored()
             self.video_view.fill()

@@ -287,6 +287,8 @@ def test_a_run_is_stopped_and_another_tab_goes_on(open_tab, app):
     write_video(app.folder / "long.mkv", np.concatenate([open_frames(SAMPLE, roi=(64, 48, 128, 96)).read()] * 8), 25)
     one, other = open_tab(), open_tab()
     open_another(one, "long.mkv", 384)
+    # The frames are still being measured.
+    one.get_by_label("last", exact=True).fill("382")
     begin_run(one)
     press(other, "Preview")
     press(one, "Stop")
@@ -294,6 +296,7 @@ def test_a_run_is_stopped_and_another_tab_goes_on(open_tab, app):
     other.get_by_text("Preview of a part: 160×144 pixels from 24 frames").wait_for(timeout=LONG)
     one.get_by_role("button", name="Run", exact=True, disabled=False).wait_for()
     assert not one.get_by_role("heading", name="Tune").is_visible()
+    assert one.get_by_label("last", exact=True).input_value() == "382"
 
 
 def test_what_cannot_be_opened_is_said_in_one_line(open_tab, tmp_path):
