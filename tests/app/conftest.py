@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -15,6 +16,7 @@ import pytest
 from conftest import make_sequence
 from turbrestore.io.images import write_image
 from turbrestore.io.video import open_frames, write_video
+from turbrestore_app.job import Job
 
 EVIL = "<img src=x onerror=document.title='taken'>.mkv"
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "chart.mkv"
@@ -164,6 +166,14 @@ def folder(tmp_path_factory):
     (folder / "below").mkdir()
     (folder / "notes.txt").touch()
     return folder
+
+
+@pytest.fixture
+def held(monkeypatch):
+    """Hold whatever begins to run until this event is set."""
+    event, begin = threading.Event(), Job._run
+    monkeypatch.setattr(Job, "_run", lambda *words: event.wait(60) and begin(*words))
+    return event
 
 
 def ended(job):

@@ -296,9 +296,10 @@ class TestSeveral:
         ended(tab.restore_all(self.plan(tab, "a.mkv", overwrite=True)))
         assert tab.rows[0].state == "done"
 
-    def test_a_stop_ends_them_all(self, tab, tmp_path):
+    def test_a_stop_ends_them_all(self, tab, tmp_path, held):
         job = tab.restore_all(self.plan(tab, "a.mkv", "b.mkv"))
         tab.stop()
+        held.set()
         assert ended(job).state == "stopped"
         assert [row.state for row in tab.rows] == ["stopped", "stopped"]
         assert list((tmp_path / "out").iterdir()) == []
