@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from itertools import count
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.display.preview import encode_image
@@ -10,12 +10,12 @@ from turbrestore.report.pictures import to_levels
 
 # Longest side that the browser gets, pixels.
 LONGEST = 4096
-# So many are kept: what is on the page, and what it may still ask for.
-_KEPT = 24
+# So many are kept of each kind: what is on the page, and what it may still ask for.
+_KEPT = 16
 
 
 class Pictures:
-    """Encoded images, the newest ones.
+    """Encoded images, the newest ones of each kind.
 
     Parameters
     ----------
@@ -25,16 +25,15 @@ class Pictures:
 
     def __init__(self, address: str) -> None:
         self._address = address
-        self._files: OrderedDict[str, bytes] = OrderedDict()
-        self._count = 0
+        self._files: dict[str, bytes] = {}
+        self._numbers = count(1)
 
-    def put(self, image: FloatArray, shown: tuple[float, float] = (0.0, 1.0)) -> str:
+    def put(self, image: FloatArray, shown: tuple[float, float] = (0.0, 1.0), kind: str = "stage") -> str:
         """Encode an image, with the intensities that are black and white, and return its address."""
-        self._count += 1
-        name = f"{self._count}.png"
+        name = f"{kind}{next(self._numbers)}.png"
         self._files[name] = encode_image(to_levels(image, *shown, LONGEST))
-        while len(self._files) > _KEPT:
-            self._files.popitem(last=False)
+        for old in [each for each in tuple(self._files) if each.startswith(kind)][:-_KEPT]:
+            self._files.pop(old, None)
         return f"{self._address}/{name}"
 
     def get(self, name: str) -> bytes | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import secrets
 import socket
@@ -32,6 +33,8 @@ _FAREWELL = 1
 # Seconds after which a tab that has left is forgotten, and after which one that does not answer is called again: the
 # server answers late while all cores work.
 _ABSENCE, _SILENCE = 3.0, 20.0
+# Seconds between two looks at pages that are on their way.
+_BEAT = 0.1
 
 
 def serve(
@@ -137,7 +140,7 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
 
 async def _show(shown: dict[str, tuple[Tab, str]], tabs: set[Tab], folders: Folders, file: Path | None) -> None:
     """Show a tab of the browser what it had before it was loaded again, or a new page."""
-    from nicegui import ui
+    from nicegui import app, ui
 
     from .views.page import Page, add_styles_and_scripts
 
@@ -152,7 +155,10 @@ async def _show(shown: dict[str, tuple[Tab, str]], tabs: set[Tab], folders: Fold
     shown[name] = tab, client.id
     tabs.add(tab)
 
-    def leave() -> None:
+    async def leave() -> None:
+        # Any page that is still on its way to a busy browser may be this tab, loaded again.
+        while any(not each.has_socket_connection for each in app.clients("/")):
+            await asyncio.sleep(_BEAT)
         if shown.get(name) == (tab, client.id):
             del shown[name]
             tabs.discard(tab)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
@@ -17,7 +16,7 @@ from ..clip import LOOKED_THROUGH
 from ..job import one_line
 from ..pictures import LONGEST
 from ..tab import Tab
-from .elements import Notices, set_most
+from .elements import Notices, in_thread, set_most
 
 if TYPE_CHECKING:
     from turbrestore.io.source import Roi
@@ -76,7 +75,7 @@ class ClipView:
         assert clip is not None
         width, height = clip.size
         middle = len(clip.source) // 2
-        self._levels = shown_range(await asyncio.to_thread(clip.frame, middle))
+        self._levels = shown_range(await in_thread(clip.frame, middle))
         brighter = "" if self._levels == (0, 1) else f" Shown brighter: white is {self._levels[1]:.3g} of full scale."
         self._hint.text = f"Drag a rectangle to restore that part alone; a click removes it.{brighter}"
         # The frame is not wider than its height on the page allows.
@@ -87,7 +86,6 @@ class ClipView:
         self._shown = -1
         self._scrubber.value = middle
         await self._show(middle)
-        self.draw(None)
         await self._fill_strip(clip)
 
     async def _fill_strip(self, clip: Clip) -> None:
@@ -95,7 +93,7 @@ class ClipView:
         self._strip.clear()
         if len(clip.source) > LOOKED_THROUGH:
             return
-        pictures = await asyncio.to_thread(_thumbnails, clip, self._levels)
+        pictures = await in_thread(_thumbnails, clip, self._levels)
         if clip is not self._tab.clip:
             return
         with self._strip:
@@ -164,8 +162,8 @@ class ClipView:
         try:
             while self._shown != self._wanted:
                 number = self._wanted
-                image = await asyncio.to_thread(clip.frame, number)
-                self._image.set_source(await asyncio.to_thread(self._tab.pictures.put, image, self._levels))
+                image = await in_thread(clip.frame, number)
+                self._image.set_source(await in_thread(self._tab.pictures.put, image, self._levels, "frame"))
                 self._shown = number
         except Exception as error:
             self._notices.tell(one_line(error))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 from collections.abc import Callable
 
@@ -15,6 +14,7 @@ from turbrestore.report.pictures import Gallery, Picture, shown_range, stages, s
 from ..pictures import LONGEST
 from ..restoring import Restored
 from ..tab import Tab
+from .elements import in_thread
 
 _TITLES = {
     "frame": "Frame",
@@ -57,10 +57,13 @@ class CompareView:
 
     async def show(self, images: dict[str, FloatArray], note: str) -> None:
         """Show the images that there are, the last one on the right."""
-        known = [key for key in _TITLES if key in images]
-        self._levels = await asyncio.to_thread(shown_range, images[known[-1]])
-        pictures = [await asyncio.to_thread(self._picture, key, images[key]) for key in known]
-        stretch = stretch_of(await asyncio.to_thread(to_levels, images[known[-1]], *self._levels))
+        clip, known = self._tab.clip, [key for key in _TITLES if key in images]
+        self._levels = await in_thread(shown_range, images[known[-1]])
+        pictures = [await in_thread(self._picture, key, images[key]) for key in known]
+        stretch = stretch_of(await in_thread(to_levels, images[known[-1]], *self._levels))
+        # Another clip may have been opened meanwhile.
+        if clip is not self._tab.clip:
+            return
         low, high = self._levels
         scale = "" if (low, high) == (0, 1) else f", black is {low:.4g} and white {high:.4g} of full scale"
         markup = comparison(Gallery(tuple(pictures), f"8 bits{scale}", stretch))
@@ -95,14 +98,14 @@ class CompareView:
             for span, whole, offset in zip((rows, columns), part, (y, x), strict=True)
         )
         result[rows, columns] = image[inside]
-        address = await asyncio.to_thread(self._tab.pictures.put, result, self._levels)
+        address = await in_thread(self._tab.pictures.put, result, self._levels, "part")
         ui.run_javascript(f'turbrestore.replace("result", {json.dumps(address)})')
         self._note.text = note
 
     async def middle(self) -> tuple[float, float]:
         """Return the point of the result in the middle of what is seen, as shares of its width and height."""
         try:
-            x, y = await ui.run_javascript("turbrestore.middle()", timeout=2.0)
+            x, y = await ui.run_javascript("turbrestore.middle()", timeout=2.0) or (0.5, 0.5)
         except TimeoutError:
             return 0.5, 0.5
         return float(x), float(y)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 import html
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TypeVar, TypeVarTuple
 
 from nicegui import ui
 
 from ..folders import printable
 from ..job import one_line
+
+Words = TypeVarTuple("Words")
+Result = TypeVar("Result")
 
 
 class Notices:
@@ -74,6 +79,15 @@ class Command:
     def _copy(self) -> None:
         ui.clipboard.write(self._words)
         self._note.text = "The command is copied; run it in the folder where the app was started."
+
+
+async def in_thread(function: Callable[[*Words], Result], *words: *Words) -> Result:
+    """Return what a function returns in a thread; a page that was left meanwhile goes no further."""
+    content = ui.context.client.content
+    result = await asyncio.to_thread(function, *words)
+    if content.is_deleted:
+        raise asyncio.CancelledError
+    return result
 
 
 def named_slider(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import re
 from collections.abc import Callable
 
@@ -11,7 +10,7 @@ from nicegui import ui
 from turbrestore.core.errors import require
 
 from ..tab import Tab
-from .elements import Notices
+from .elements import Notices, in_thread
 from .progress_view import ProgressView
 
 # What Linux calls cameras.
@@ -65,7 +64,7 @@ class LiveView:
             return
         self._shown = newest
         for words, picture in self._pictures.items():
-            address = await asyncio.to_thread(self._tab.pictures.put, job.images[words])
+            address = await in_thread(self._tab.pictures.put, job.images[words], (0.0, 1.0), "live")
             picture.content = f'<img src="{address}" alt="{words}" style="width: 100%">'
 
     def _start(self) -> None:

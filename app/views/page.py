@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -18,7 +17,7 @@ from ..restoring import Restored
 from ..tab import Tab
 from .clip_view import ClipView
 from .compare_view import CompareView
-from .elements import Notices
+from .elements import Notices, in_thread
 from .live_view import LiveView
 from .open_view import OpenView
 from .run_view import RunView
@@ -81,7 +80,7 @@ class Page:
         """Open a clip that is allowed, and show it."""
         with self.notices.catching():
             with self.notices.waiting(f"Reading {path.name} …"):
-                clip = await asyncio.to_thread(self.tab.open, path)
+                clip = await in_thread(self.tab.open, path)
             self.compare_view.clear()
             self.sweep_view.clear()
             self.video_view.fill()
@@ -108,6 +107,9 @@ class Page:
     async def _opened(self, clip: Clip) -> None:
         self.notices.name(clip.name)
         self.open_view.opened()
+        self.run_view.opened()
+        if self.tab.restored is not None:
+            self.run_view.take_over(self.tab.restored.order)
         self.save_view.opened()
         self.tune_view.opened()
         self.steady_view.opened()
@@ -115,7 +117,7 @@ class Page:
         self.look_at("clip")
         self._refresh()
         await self.clip_view.opened()
-        await self.run_view.opened()
+        await self.run_view.measure()
 
     async def _go_on(self) -> None:
         """Show again what a page that was loaded anew had open; a run that is running or has ended is followed."""
@@ -124,7 +126,6 @@ class Page:
         with self.notices.catching():
             await self._opened(clip)
             if restored is not None:
-                self.run_view.take_over(restored.order)
                 await self.compare_view.show_result(restored)
                 await self.tune_view.restored()
             self.video_view.fill()
@@ -210,13 +211,14 @@ class Page:
     async def _show_images(self) -> None:
         """Show the images of the stages that are done."""
         job = self.tab.job
-        if job is None or job.kind == "live" or job.state != "running" or not job.images:
+        if job is None or job.kind == "live" or job.state != "running":
             return
-        shown = len(job.images)
-        if self._seen != (job, shown):
-            self._seen = job, shown
+        # A copy: the next of several clips begins with none.
+        images = dict(job.images)
+        if images and self._seen != (job, len(images)):
+            self._seen = job, len(images)
             with self.notices.catching():
-                await self.compare_view.show(dict(job.images), "The stages that are done so far.")
+                await self.compare_view.show(images, "The stages that are done so far.")
             self._refresh()
 
 

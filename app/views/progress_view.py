@@ -67,14 +67,15 @@ class ProgressView:
         if self._bars.keys() - job.bars.keys():
             # The next of several clips.
             self._clear()
-        running = job.state == "running"
+        # Once: it may end at any moment.
+        state = job.state
         self._show_bars(job.bars.copy())
         self._show_decisions(job)
-        self._stop.visible = running
-        self._state.text = f"Finished in {job.seconds:.1f} s." if job.state == "done" else _STATES[job.state]
+        self._stop.visible = state == "running"
+        self._state.text = f"Finished in {job.seconds:.1f} s." if state == "done" else _STATES[state]
         self._state.visible = True
-        self._stages.visible = job.state != "done"
-        self._ended = not running
+        self._stages.visible = state != "done"
+        self._ended = state != "running"
         return job if self._ended else None
 
     def _show_nothing(self) -> None:

@@ -42,7 +42,7 @@ class RunView:
         self._tab, self._notices, self._on_region = tab, notices, on_region
         self._astronomy, self._stacking = AstronomyView(tab), StackingView(tab)
         self._progress = ProgressView(tab, "restore")
-        self.follow = self._progress.follow
+        self.follow, self.measure = self._progress.follow, self._stacking.measure
 
     def build(self) -> None:
         """Make the elements."""
@@ -79,7 +79,7 @@ class RunView:
             self._method = ui.label("").classes("note")
             self._progress.build_bars()
 
-    async def opened(self) -> None:
+    def opened(self) -> None:
         """Start from the whole of a new clip."""
         clip = self._tab.clip
         assert clip is not None
@@ -88,7 +88,7 @@ class RunView:
         self.set_region(None)
         self._typed()
         self._astronomy.opened()
-        await self._stacking.opened()
+        self._stacking.opened()
 
     def show_method(self, params: DeconvolutionParams | None) -> None:
         """Say that the next run removes the blur that was chosen, where one was."""

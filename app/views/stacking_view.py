@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 from functools import partial
 from typing import TYPE_CHECKING
@@ -14,7 +13,7 @@ from turbrestore.stacking.quality import QualityList, sort_by_quality
 
 from ..clip import LOOKED_THROUGH
 from ..tab import Tab
-from .elements import named_slider
+from .elements import in_thread, named_slider
 
 if TYPE_CHECKING:
     import numpy as np
@@ -72,15 +71,20 @@ class StackingView:
                 self._scale = ui.select(_SCALES, label="Grid of the result", value=1.0)
                 self._scale.props("dense outlined options-dense").classes("grow")
 
-    async def opened(self) -> None:
-        """Start from all frames of a new clip, and measure them."""
+    def opened(self) -> None:
+        """Start from all frames of a new clip."""
         clip = self._tab.clip
         assert clip is not None
         self._measured = None
         self._keep.value, self._reference.value, self._scale.value = 100, "", 1.0
         self.show_range(0, len(clip.source))
+
+    async def measure(self) -> None:
+        """Measure the frames of the clip; what the user chooses meanwhile stays."""
+        clip = self._tab.clip
+        assert clip is not None
         if len(clip.source) <= LOOKED_THROUGH:
-            measured = await asyncio.to_thread(clip.quality)
+            measured = await in_thread(clip.quality)
             if clip is self._tab.clip:
                 self._measured = measured
         self.show_range(*self._range)

@@ -17,6 +17,7 @@ from turbrestore.report.pictures import shown_range, to_levels
 from ..restoring import Restored
 from ..tab import Tab
 from ..tuning import sweep
+from .elements import in_thread
 
 
 class SweepView:
@@ -54,7 +55,7 @@ class SweepView:
         number, levels, begun = self._number, None, asyncio.get_running_loop().time()
         images = sweep(restored, params, widths)
         for count, width in enumerate((0.0, *widths)):
-            panel = await asyncio.to_thread(next, images, None)
+            panel = await in_thread(next, images, None)
             if panel is None or number != self._number or self._tab.closed or self._tab.restored is not restored:
                 return
             title, image = panel

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 import math
 import time
@@ -18,7 +17,7 @@ from turbrestore_cli.deblurring import widths_of
 from ..tab import Tab
 from ..tuning import SLOW, automatic_fidelity, impressions, part_around, tuned_params
 from .compare_view import CompareView
-from .elements import Notices, named_slider, set_most
+from .elements import Notices, in_thread, named_slider, set_most
 from .sweep_view import SweepView
 
 if TYPE_CHECKING:
@@ -127,7 +126,7 @@ class TuneView:
         restored = self._tab.restored
         assert restored is not None
         self._automatic = params.fidelity is None
-        measured = await asyncio.to_thread(automatic_fidelity, restored, params)
+        measured = await in_thread(automatic_fidelity, restored, params)
         self._setting = True
         set_most(self._sigma, max(6.0, math.ceil(2 * (params.sigma or 0))))
         self._sigma.value = params.sigma or 0.0
@@ -201,8 +200,9 @@ class TuneView:
         images = impressions(restored, params, part, lambda: number != self._wanted or self._tab.closed)
         rounds = 2 if params.method in SLOW else 1
         for count in range(1, rounds + 1):
-            image = await asyncio.to_thread(next, images, None)
-            if image is None:
+            image = await in_thread(next, images, None)
+            # Another clip may have been opened, or another result made.
+            if image is None or restored is not self._tab.restored:
                 return
             note = self._words(image, time.perf_counter() - begun, count < rounds)
             await self._compare.show_part(restored, part, image, note)

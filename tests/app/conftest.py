@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -15,6 +16,7 @@ import pytest
 from conftest import make_sequence
 from turbrestore.io.images import write_image
 from turbrestore.io.video import open_frames, write_video
+from turbrestore_app.job import Job
 
 EVIL = "<img src=x onerror=document.title='taken'>.mkv"
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "chart.mkv"
@@ -39,7 +41,7 @@ class App:
     def ask(self, path="", method="GET", **headers):
         """Status of the answer to a request."""
         parts = urlsplit(self.address)
-        connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=10)
+        connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=60)
         connection.putrequest(method, path or parts.path, skip_host="Host" in headers)
         for name, value in headers.items():
             connection.putheader(name.replace("_", "-"), value)
@@ -65,7 +67,7 @@ def app(tmp_path_factory):
     yield app
     if app.process.poll() is None:
         app.process.send_signal(signal.SIGINT)
-    _, complaints = app.process.communicate(timeout=20)
+    _, complaints = app.process.communicate(timeout=60)
     # A bug would have left its traceback.
     assert (app.process.returncode, complaints) == (130, "turbrestore: interrupted\n")
     assert list(temporary.iterdir()) == []
@@ -83,7 +85,7 @@ def window(browser, app):
 
 def load(page, app):
     page.goto(app.address)
-    page.locator("#frame img").wait_for()
+    page.wait_for_function("document.querySelector('#frame img')?.naturalWidth > 0")
     page.locator("svg.quality").wait_for(state="attached")
 
 
@@ -138,6 +140,12 @@ def open_another(page, name, frames):
     page.locator(".sum").get_by_text(f", {frames} frames").wait_for()
 
 
+def wait_for_result(page, words):
+    """Wait for the first result of a page, and for the width of its blur and its command, which come after it."""
+    page.get_by_text(words).wait_for(timeout=LONG)
+    page.locator(".value").get_by_text(" px").wait_for()
+
+
 def drop(page, name, data):
     """Drop a file anywhere on the page."""
     dragged = """([name, data]) => {
@@ -158,6 +166,14 @@ def folder(tmp_path_factory):
     (folder / "below").mkdir()
     (folder / "notes.txt").touch()
     return folder
+
+
+@pytest.fixture
+def held(monkeypatch):
+    """Hold whatever begins to run until this event is set."""
+    event, begin = threading.Event(), Job._run
+    monkeypatch.setattr(Job, "_run", lambda *words: event.wait(60) and begin(*words))
+    return event
 
 
 def ended(job):

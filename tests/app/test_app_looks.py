@@ -5,7 +5,7 @@ import itertools
 
 import pytest
 
-from .conftest import LONG, open_another, press
+from .conftest import LONG, open_another, press, wait_for_result
 
 SIZES = ((390, 844), (768, 1024), (1280, 860), (1440, 900))
 SCHEMES = ("light", "dark")
@@ -73,6 +73,12 @@ def sideways(page):
     return page.evaluate("document.documentElement.scrollWidth - innerWidth")
 
 
+def show_in(page, scheme):
+    """Have the page in a light or dark scheme; a script of the library follows it."""
+    page.emulate_media(color_scheme=scheme)
+    page.wait_for_function(f"document.body.classList.contains('body--{scheme}')")
+
+
 def open_all(page):
     """Open what can be unfolded, and leave out what moves."""
     page.evaluate("for (const part of document.querySelectorAll('details')) part.open = true")
@@ -84,8 +90,7 @@ def test_fits_every_window_in_both_schemes(open_tab):
     sizes = ((1440, 900), (1280, 860), (1024, 768), (899, 700), (768, 1024), (390, 844))
     for (width, height), scheme in itertools.product(sizes, SCHEMES):
         page.set_viewport_size({"width": width, "height": height})
-        page.emulate_media(color_scheme=scheme)
-        page.wait_for_timeout(150)
+        show_in(page, scheme)
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         cut = "(labels) => labels.map((label) => label.scrollWidth - label.clientWidth)"
         assert page.locator(".four .q-field__label").evaluate_all(cut) == [0] * 4
@@ -108,8 +113,7 @@ def test_everything_can_be_read_and_reached(open_tab):
     page = open_tab()
     open_all(page)
     for scheme in SCHEMES:
-        page.emulate_media(color_scheme=scheme)
-        page.wait_for_timeout(400)
+        show_in(page, scheme)
         assert (scheme, page.evaluate(FAINT)) == (scheme, [])
         page.mouse.click(5, 5)
         reached = []
@@ -127,16 +131,17 @@ def test_axe_finds_nothing_serious_in_any_window(open_tab):
     page = open_tab(SIZES[-1])
     open_another(page, "small.mkv", 8)
     press(page, "Run")
-    page.get_by_text("64×64 pixels from 8 frames").wait_for(timeout=LONG)
+    wait_for_result(page, "64×64 pixels from 8 frames")
     press(page, "Compare widths")
     page.get_by_text("4 of 4 widths").wait_for(timeout=LONG)
     open_all(page)
     views = itertools.cycle(("Clip", "Compare", "Widths"))
     for size, scheme in itertools.product(SIZES, SCHEMES):
         page.set_viewport_size({"width": size[0], "height": size[1]})
-        page.emulate_media(color_scheme=scheme)
+        show_in(page, scheme)
         for _ in range(2):
             press(page, view := next(views))
+            page.get_by_role("button", name=view, exact=True, pressed=True).wait_for()
             assert (size, view, sideways(page)) == (size, view, 0)
         assert (size, scheme, view, serious(page)) == (size, scheme, view, [])
     # A fault is found.

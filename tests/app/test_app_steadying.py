@@ -77,10 +77,11 @@ class TestSteady:
         tab.close()
         assert not tab.steadied.film_path.exists()
 
-    def test_a_stop_leaves_nothing(self, folder, tmp_path):
+    def test_a_stop_leaves_nothing(self, folder, tmp_path, held):
         tab = Tab(Folders(folder))
         job = tab.steady(SteadyOrder(folder / "clip.mkv", tmp_path / "a.mp4"))
         tab.stop()
+        held.set()
         assert ended(job).state == "stopped"
         assert (tab.steadied, list(tmp_path.iterdir())) == (None, [])
         tab.close()

@@ -1,6 +1,7 @@
 """A blur that differs between parts of an image is found and removed; one that does not is taken as one."""
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 
 import cv2
@@ -215,11 +216,17 @@ def test_after_an_interrupt_the_remaining_tiles_are_left_out(monkeypatch):
 
     def interrupt(*_):
         begun.wait(20)
-        threading.Timer(0.2, interrupted.set).start()
         raise KeyboardInterrupt
         yield
 
+    class Pool(ThreadPoolExecutor):
+        def __exit__(self, *error):
+            # Whoever works in it has been told to stop.
+            interrupted.set()
+            return super().__exit__(*error)
+
     interrupted = threading.Event()
+    monkeypatch.setattr("turbrestore.blind.remove_blur.ThreadPoolExecutor", Pool)
     monkeypatch.setattr("turbrestore.blind.blur_map.find_candidates", estimated)
     monkeypatch.setattr("turbrestore.blind.remove_blur.deconvolve_steps", interrupt)
     with pytest.raises(KeyboardInterrupt):

@@ -118,6 +118,7 @@ def slow(words):
     try:
         os.kill(os.getpid(), signal.SIGINT)
         time.sleep(30)
+        print("slept", flush=True)
     finally:
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGTERM)
@@ -133,10 +134,8 @@ program()
 
 
 def test_more_signals_do_not_disturb_the_saving():
-    start = time.monotonic()
     done = subprocess.run([sys.executable, "-c", ENDING], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (130, "saved\n", "turbrestore: interrupted\n")
-    assert time.monotonic() - start < 25
 
 
 def test_a_saving_that_hangs_can_be_ended(monkeypatch):

@@ -21,9 +21,11 @@
     shown.textContent = String(number);
   };
   const drawNow = () => draw(film.currentTime);
-  // The callback tells the time of the frame that is seen; without it the time of the player is near enough.
+  // The callback tells the time of the frame that is seen; without it the time of the player is near enough.  Where the
+  // film stands still the callback may be late, and tell of a frame before.
+  const seen = (frame) => { if (!film.seeking) draw(film.paused ? film.currentTime : frame.mediaTime); };
   const follow = film.requestVideoFrameCallback
-    ? () => film.requestVideoFrameCallback((_, frame) => { draw(frame.mediaTime); follow(); })
+    ? () => film.requestVideoFrameCallback((_, frame) => { seen(frame); follow(); })
     : () => requestAnimationFrame(() => { if (!film.paused) drawNow(); if (film.isConnected) follow(); });
 
   // The middle of a frame, where no rounding leads to its neighbour.
