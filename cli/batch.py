@@ -162,6 +162,7 @@ def work(order: Order) -> ClipRow:
         # A process that was killed while it did the same may have left a result.
         restoration, source = restore_clip(dataclasses.replace(order, overwrite=True, quiet=True))
         x, y, width, height = restoration.crop
+        checks = restoration.verdict.checks
         middle = len(source) // 2
         return dataclasses.replace(
             row,
@@ -171,7 +172,8 @@ def work(order: Order) -> ClipRow:
             height=height,
             blur=0.0 if restoration.deconvolution is None else float(restoration.deconvolution.sigma),
             seconds=float(sum(restoration.seconds.values())),
-            remarks="; ".join((*source.warnings, *restoration.verdict.checks)),
+            checks="; ".join(checks),
+            remarks="; ".join(remark for remark in source.warnings if remark not in checks),
             before=thumbnail_uri(source.read(middle, middle + 1)[0][y : y + height, x : x + width]),
             after=thumbnail_uri(restoration.image),
         )

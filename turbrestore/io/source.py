@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.arrays import CHANNELS, FloatArray
+from ..core.decision import Doubt
 from ..core.errors import ConfigurationError, DataError, require
 from ..runtime.scratch import iter_frames
 from .output import size_text
@@ -53,7 +54,7 @@ class FrameSource:
     timestamps : ndarray, float64, shape (T,), or None
         Seconds since the first frame of the file, after the selection.
     warnings : tuple of str
-        What was left out, or is unusual.
+        What was left out, or is unusual; those that a person has to check are of the type :class:`Doubt`.
     damaged : tuple of int
         Numbers, in the file, of frames that are known to be damaged.
     levels : tuple of float or None
@@ -368,7 +369,7 @@ def check_cut_short(
     The other frames may be missing if ``skip_damaged`` is true, or if frames from ``stop`` on are not needed.
     """
     if skip_damaged and intact:
-        return (f"cut short; only its first {intact} frames are used",)
+        return (Doubt(f"cut short; only its first {intact} frames are used"),)
     if stop is not None and stop <= intact:
         return ()
     if intact < 1:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..results import Restoration, Verdict
+from ..results import Restoration
 from ..runs.run_record import RunRecord
 from ..settings import RestoreParams
 from ..wording import interval_words
@@ -90,13 +90,6 @@ def findings(restoration: Restoration) -> list[Fact]:
         *_seeing_facts(restoration),
         *_uncertainty_facts(restoration),
     ]
-
-
-def verdict(restoration: Restoration, run: RunRecord) -> Verdict:
-    """Return the verdict on a restoration, whose checks begin with the remarks of the reader and of the flow model."""
-    found = restoration.verdict
-    notes = () if restoration.dynamics is None else restoration.dynamics.notes
-    return dataclasses.replace(found, checks=(*run.warnings, *notes, *found.checks))
 
 
 def settings(run: RunRecord, defaults: Mapping[str, Any] | None = None) -> list[Setting]:

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray
-from ...core.decision import Decision
+from ...core.decision import Decision, Doubt
 from ...core.errors import ConfigurationError, DataError, require_between
 from ...io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
 from ...io.source import FrameSource, numbers_text
@@ -333,10 +333,9 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
     if len(report.scenes) > 1:
         longest = max(report.scenes, key=lambda scene: scene.count)
         others = ", ".join(f"{scene.first}:{scene.last + 1}" for scene in report.scenes if scene is not longest)
-        lines.append(
-            f"{len(report.scenes)} scenes: only the longest is used, {longest.count} frames from {longest.first} to "
-            f"{longest.last}; to use another, select its frames ({others})"
-        )
+        used = f"{longest.count} frames from {longest.first} to {longest.last}"
+        choice = f"only the longest is used, {used}; to use another, select its frames ({others})"
+        lines.append(Doubt(f"{len(report.scenes)} scenes: {choice}"))
     if report.saturated >= _SATURATED:
         lines.append(f"{100 * report.saturated:.0f} % of the values are at white: detail there is lost")
     return lines

@@ -20,6 +20,7 @@ from typing import IO, TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.decision import Doubt
 from ...core.errors import DataError
 from ...core.extras import missing_package
 from ..limits import Limits, check_input, format_errors, input_errors
@@ -199,7 +200,7 @@ def _image(path: Path, cards: list[str], header: Header, offset: int) -> FitsIma
     pattern = str(header.get("BAYERPAT", "")).strip()
     bayer = _first_colours(pattern, header, shape[-2] if bottom_up and len(shape) > 1 else None)
     if pattern and bayer is None:
-        notes.append(f"the Bayer pattern {pattern} is unknown, so it is not made into colour")
+        notes.append(Doubt(f"the Bayer pattern {pattern} is unknown, so it is not made into colour"))
     missing = blank if dtype.kind in "iu" and isinstance(blank, int) else None
     name = re.sub(r"[\s_-]*\d*$", "", str(header.get("EXTNAME", "")).strip().upper())
     return FitsImage(path, tuple(cards), shape, dtype, offset, (scale, zero), missing, tuple(notes), bayer, name)
