@@ -80,8 +80,7 @@ class CompareView:
         if found.finer is not None:
             images["finer"] = found.finer
             note += f"; the finer image, of {found.finer.shape[1]}×{found.finer.shape[0]}, is what is saved"
-        verdict = await asyncio.to_thread(lambda: found.verdict)
-        await self.show(images, f"{note}. Verdict: {verdict}")
+        await self.show(images, note)
         self._shown = restored
 
     async def show_part(self, restored: Restored, part: tuple[slice, slice], image: FloatArray, note: str) -> None:

@@ -71,7 +71,8 @@ class ProgressView:
         self._show_bars(job.bars.copy())
         self._show_decisions(job)
         self._stop.visible = running
-        self._state.text = f"Finished in {job.seconds:.1f} s." if job.state == "done" else _STATES[job.state]
+        done = f"Finished in {job.seconds:.1f} s. {job.message}"
+        self._state.text = done if job.state == "done" else _STATES[job.state]
         self._state.visible = True
         self._stages.visible = job.state != "done"
         self._ended = not running

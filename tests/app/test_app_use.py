@@ -53,6 +53,8 @@ def test_from_the_clip_to_the_saved_image(open_tab, app, monkeypatch):
     assert page.locator("#right option").all_inner_texts() == ["Frame", "Mean", "Centroid", "Filtered", "Result"]
     page.get_by_text("decisions").click()
     assert page.locator("dt").get_by_text("blur: ").is_visible()
+    verdict = re.compile(r"Finished in .+ s\. Verdict: .+ 16 frames.+(looks right|check: .+)\.$")
+    assert page.get_by_text(verdict).is_visible()
 
     stage, before = page.locator("#stage"), pixels(page.locator("#stage"))
     begun = time.monotonic()
@@ -240,7 +242,7 @@ def test_several_clips_and_a_steadied_video(open_tab, app):
         page.get_by_role("checkbox", name=name, exact=True).click()
     press(page, "Restore them")
     rows = page.locator(".rows tr")
-    rows.nth(1).get_by_text("done: restored/small.png, ").wait_for(timeout=LONG)
+    rows.nth(1).get_by_text("done: restored/small.png (").wait_for(timeout=LONG)
     assert rows.nth(0).inner_text().startswith(f"{EVIL}\tfailed: ") and page.title() == "turbrestore"
     try:
         assert {path.name for path in (app.folder / "restored").iterdir()} == {"small.png", "small.png.toml"}
