@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from turbrestore.core.errors import TurbrestoreError, require
+from turbrestore.core.remarks import counted
 from turbrestore.io.limits import first_line
 from turbrestore.report.batch_page import ClipRow, thumbnail_uri
 from turbrestore.runs.folder_lock import lock_folder
@@ -131,9 +132,9 @@ def batch(
     failed = [row for row in rows if row.state != "done"]
     if json:
         print_json({"out": str(out), "clips": [figures(row) for row in rows]})
-    say(f"{out}: {len(rows) - len(failed)} of {len(rows)} clips restored", quiet)
+    say(f"{out}: {len(rows) - len(failed)} of {counted(len(rows), 'clip')} restored", quiet)
     if failed:
-        raise TurbrestoreError(f"batch: {len(failed)} of {len(rows)} clips failed; {out / TABLE} says why")
+        raise TurbrestoreError(f"batch: {len(failed)} of {counted(len(rows), 'clip')} failed; {out / TABLE} says why")
 
 
 def _folder_last(paths: tuple[Path, ...], out: Path | None) -> tuple[tuple[Path, ...], Path]:

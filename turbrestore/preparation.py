@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .agreement.sensor_pattern import without_stripes
-from .core.decision import Decision, Doubt
+from .core.decision import Decision
+from .core.remarks import Doubt
 from .footage.background import without_moving_objects
 from .footage.bars import Bars, without_bars
 from .footage.levels import Levels, stretch_levels

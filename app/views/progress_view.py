@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
+from turbrestore.core.remarks import counted
 from turbrestore_cli.progress import TITLES
 
 from ..tab import Tab
@@ -110,9 +111,8 @@ class ProgressView:
             for decision in decisions
         )
         shown = "" if job.state == "done" else " open"
-        head = "1 decision" if len(decisions) == 1 else f"{len(decisions)} decisions"
         content = (
-            f'<details class="decisions"{shown}><summary class="note">{head}</summary>'
+            f'<details class="decisions"{shown}><summary class="note">{counted(len(decisions), "decision")}</summary>'
             f'<dl class="decided">{"".join(lines)}</dl></details>'
         )
         self._decided.visible = bool(decisions)

@@ -33,9 +33,3 @@ class Decision:
 
     def __str__(self) -> str:
         return f"{self.subject}: {self.choice}; {self.reason}"
-
-
-class Doubt(str):
-    """A remark on a clip that a person has to check; others say what was done, and need no attention."""
-
-    __slots__ = ()

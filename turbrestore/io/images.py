@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_image, from_unit, from_unit_to_type
-from ..core.decision import Doubt
 from ..core.errors import DataError, StorageError, TurbrestoreError
+from ..core.remarks import Doubt
 from .astronomy.fits import read_fits
 from .astronomy.fits_header import FITS_SUFFIXES, is_fits
 from .astronomy.fits_output import write_fits

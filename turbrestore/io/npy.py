@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import CHANNELS, FloatArray, from_unit_to_type
-from ..core.decision import Doubt
 from ..core.errors import DataError
+from ..core.remarks import Doubt
 from ..runtime.scratch import iter_parts, new_stack
 from .counts import source_of_numbers
 from .limits import DEFAULT_LIMITS, Limits, check_input, format_errors, input_errors

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
-from ..core.decision import Doubt
 from ..core.errors import DataError, require
+from ..core.remarks import Doubt
 
 PixelArray = NDArray[Any]
 

@@ -25,8 +25,8 @@ from typing import Literal
 import numpy as np
 
 from ..core.arrays import FloatArray, check_image
-from ..core.decision import Doubt
 from ..core.errors import DataError, require
+from ..core.remarks import Doubt
 from .astronomy.fits import open_fits
 from .astronomy.fits_header import FITS_SUFFIXES, is_fits
 from .astronomy.ser import open_ser, write_ser

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..core.remarks import counted
 from ..results import Restoration
 from ..runs.run_record import RunRecord
 from ..settings import RestoreParams
@@ -113,9 +114,10 @@ def laps(restoration: Restoration) -> list[Lap]:
 
 def _motion_facts(restoration: Restoration) -> Iterator[Fact]:
     centroid, dynamics = restoration.centroid, restoration.dynamics
+    iterations = counted(centroid.mean_flow_sizes.size, "iteration")
     yield Fact(
         "Centroid",
-        f"{centroid.mean_flow_sizes.size} iterations, {centroid.mean_flow_sizes[-1]:.2f} px mean flow remaining",
+        f"{iterations}, {centroid.mean_flow_sizes[-1]:.2f} px mean flow remaining",
         "converged" if centroid.converged else "not converged: allow more iterations",
         not centroid.converged,
     )
@@ -123,7 +125,7 @@ def _motion_facts(restoration: Restoration) -> Iterator[Fact]:
         return
     yield Fact(
         "Flow model",
-        f"{dynamics.rank} states, {100 * dynamics.energy_share:.1f} % of the motion",
+        f"{counted(dynamics.rank, 'state')}, {100 * dynamics.energy_share:.1f} % of the motion",
         "overfitted: too few flows for so many states" if dynamics.overfitted else f"of {dynamics.frame_count} flows",
         dynamics.overfitted,
     )
@@ -164,7 +166,9 @@ def _blur_facts(restoration: Restoration) -> Iterator[Fact]:
         yield Fact("Noise before deblurring", f"{100 * done.noise:.2f} %", "of full scale")
         if done.sigma > 0:
             note = "converged" if done.converged else "not converged: allow more iterations"
-            value = f"{done.sigma:.2f} px removed in {done.iterations} iterations, fidelity {done.fidelity:.0f}"
+            value = (
+                f"{done.sigma:.2f} px removed in {counted(done.iterations, 'iteration')}, fidelity {done.fidelity:.0f}"
+            )
             yield Fact("Deconvolution", value, note, not done.converged)
 
 

@@ -20,9 +20,9 @@ from typing import IO, TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.decision import Doubt
 from ...core.errors import DataError
 from ...core.extras import missing_package
+from ...core.remarks import Doubt
 from ..limits import Limits, check_input, format_errors, input_errors
 from ..pixels import BAYER_CODES
 
