@@ -286,9 +286,9 @@ class _Facts:
         """One line for a person."""
         found = self.figures
         count, moved = counted(len(found.moving), "frame"), float(np.mean(found.displacement))
-        blur = f"blur of {found.sigma:.2f} pixels removed" if found.sigma > 0 else "no blur removed"
+        blur = f" and {found.sigma:.2f} pixels of blur" if found.sigma > 0 else ""
         return (
-            f"{count} in {found.seconds:.1f} s, displacements of {moved:.2f} pixels and {blur}, "
+            f"{count} in {found.seconds:.1f} s, with {moved:.2f} pixels of motion{blur} removed; "
             f"{100 * np.mean(found.moving):.0f} % of the image moves{self._astray()}"
         )
 

@@ -187,7 +187,7 @@ def _seeing_facts(restoration: Restoration) -> Iterator[Fact]:
     notes = {
         "displacement_variance": "per axis, over a long time; 95 % interval",
         "displacement_by_flow": "over this clip",
-        "displacement_by_blur": "over this clip, from the blur of the mean; a lower bound above 2 px²",
+        "displacement_by_blur": "over this clip, from the blur of the mean; above 2 px² it is a lower bound",
         "isoplanatic_patch": "separation at which the motion is half correlated",
         "coherence_time": "lag at which the correlation of the motion falls to 1/e",
     }
