@@ -67,7 +67,7 @@ class Job(Generic[Result_co]):
     ----------
     state : {"running", "done", "stopped", "failed"}
     message : str
-        One line on how it ended, where it failed.
+        One line on how it ended: the verdict on an image, or why it failed.
     bars : dict of str to Bar
         Progress of every stage that has begun.
     decisions : list of Decision

@@ -108,6 +108,7 @@ def restore_order(order: Order, job: Job[object], earlier: Restored | None = Non
     memory.show = job.show
     restoration = restore(source, order.params, Machine().runtime(), memory, job.progress, job.decided)
     memory.show = None
+    job.message = f"Verdict: {restoration.verdict}."
     return Restored(order, restoration, source, frame, memory)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from turbrestore.core.errors import ConfigurationError
 from turbrestore_cli.batch_plan import name_outputs
+from turbrestore_cli.output import summary
 
 from .folders import Entry, Folders
 from .job import Job, Stopped, one_line
@@ -25,7 +26,7 @@ class Row:
     name : str
     state : {"waiting", "running", "done", "failed", "stopped"}
     words : str
-        Where the result is, or why there is none.
+        Where the result is and the verdict on it, or why there is none.
     """
 
     name: str
@@ -123,6 +124,8 @@ def restore_all(tasks: Sequence[Task], rows: list[Row], job: Job[None]) -> None:
         except Exception as error:  # whatever happens to one clip, the others are restored
             reason = one_line(error).removeprefix(f"{task.order.path}: ").removeprefix(f"{task.order.path.name}: ")
             rows[place] = dataclasses.replace(rows[place], state="failed", words=reason)
+    # Each row has the verdict on its clip.
+    job.message = ""
 
 
 def _restore(task: Task, job: Job[None]) -> str:
@@ -131,4 +134,4 @@ def _restore(task: Task, job: Job[None]) -> str:
     restored = restore_order(task.order, job)
     job.check()
     save(restored, task.outputs, task.name, task.shown)
-    return f"{task.shown}, {sum(restored.restoration.seconds.values()):.1f} s"
+    return summary(task.shown, restored.restoration)

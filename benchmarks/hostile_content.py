@@ -130,8 +130,8 @@ CONTENT = (
     Content("duplicated.mkv", _video(lambda: _repeated(3, 4, 9)), "3 duplicated: frames 3, 4, 9 left out"),
     Content("duplicated.mkv", _video(lambda: _repeated(3, 4, 9)), "3 duplicated", True, _STRICT),
     Content("still.mkv", _video(lambda: np.repeat(clip()[:1], 12, 0)), "all frames are the same"),
-    Content("hot.mkv", _video(lambda: _with(1, (slice(None), 20, 30))), "1 stuck pixels (x 30, y 20)"),
-    Content("dead.mkv", _video(lambda: _with(0, (slice(None), 12, 40))), "1 stuck pixels (x 40, y 12)"),
-    Content("hot.mkv", _video(lambda: _with(1, (slice(None), 20, 30))), "1 stuck pixels", True, _STRICT),
+    Content("hot.mkv", _video(lambda: _with(1, (slice(None), 20, 30))), "1 stuck pixel (x 30, y 20)"),
+    Content("dead.mkv", _video(lambda: _with(0, (slice(None), 12, 40))), "1 stuck pixel (x 40, y 12)"),
+    Content("hot.mkv", _video(lambda: _with(1, (slice(None), 20, 30))), "1 stuck pixel", True, _STRICT),
     Content("times.mkv", lambda path: encode(path, clip(), "ffv1", "gray", [*range(8), 20, 21, 30, 50]), "variable"),
 )

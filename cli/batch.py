@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from turbrestore.core.errors import TurbrestoreError, require
+from turbrestore.core.remarks import counted
 from turbrestore.io.limits import first_line
 from turbrestore.report.batch_page import ClipRow, thumbnail_uri
 from turbrestore.runs.folder_lock import lock_folder
@@ -131,9 +132,9 @@ def batch(
     failed = [row for row in rows if row.state != "done"]
     if json:
         print_json({"out": str(out), "clips": [figures(row) for row in rows]})
-    say(f"{out}: {len(rows) - len(failed)} of {len(rows)} clips restored", quiet)
+    say(f"{out}: {len(rows) - len(failed)} of {counted(len(rows), 'clip')} restored", quiet)
     if failed:
-        raise TurbrestoreError(f"batch: {len(failed)} of {len(rows)} clips failed; {out / TABLE} says why")
+        raise TurbrestoreError(f"batch: {len(failed)} of {counted(len(rows), 'clip')} failed; {out / TABLE} says why")
 
 
 def _folder_last(paths: tuple[Path, ...], out: Path | None) -> tuple[tuple[Path, ...], Path]:
@@ -162,6 +163,7 @@ def work(order: Order) -> ClipRow:
         # A process that was killed while it did the same may have left a result.
         restoration, source = restore_clip(dataclasses.replace(order, overwrite=True, quiet=True))
         x, y, width, height = restoration.crop
+        checks = restoration.verdict.checks
         middle = len(source) // 2
         return dataclasses.replace(
             row,
@@ -171,7 +173,8 @@ def work(order: Order) -> ClipRow:
             height=height,
             blur=0.0 if restoration.deconvolution is None else float(restoration.deconvolution.sigma),
             seconds=float(sum(restoration.seconds.values())),
-            remarks="; ".join((*source.warnings, *restoration.verdict.checks)),
+            checks="; ".join(checks),
+            remarks="; ".join(remark for remark in source.warnings if remark not in checks),
             before=thumbnail_uri(source.read(middle, middle + 1)[0][y : y + height, x : x + width]),
             after=thumbnail_uri(restoration.image),
         )

@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 # In a folder, files of these kinds are clips; images, TIFF and FITS files are the frames of one.
 CLIP_SUFFIXES = (".mkv", ".mp4", ".m4v", ".mov", ".webm", ".avi", ".gif", ".ser", ".npy", ".apng")
 JOURNAL, TABLE, PAGE = "batch.jsonl", "summary.csv", "index.html"
-_COLUMNS = ("input", "output", "state", "reason", "frames", "width", "height", "blur", "seconds", "remarks")
+_COLUMNS = (
+    *("input", "output", "state", "reason", "frames", "width", "height", "blur", "seconds", "checks", "remarks"),
+)
 
 
 def find_clips(inputs: Iterable[Path]) -> list[Path]:

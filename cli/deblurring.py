@@ -15,6 +15,7 @@ from turbrestore.blur.measured_psf import psf_from_image
 from turbrestore.core.arrays import FloatArray, luminance
 from turbrestore.core.errors import ConfigurationError, require, require_between
 from turbrestore.core.gradient import sobel_gradient
+from turbrestore.core.remarks import counted
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.deconvolution.deconvolve import deconvolve as deconvolve_image
 from turbrestore.display.figure import new_figure
@@ -100,7 +101,7 @@ def deconvolve(
         images = _read(source, guide, limits_of(max_pixels))
         widths = widths_of(sweep, images[0].shape)
         write_figure(sheet, contact_sheet(*images, widths, deconvolution, guards, machine.runtime()), overwrite)
-        say(f"{sheet}: {len(widths)} widths side by side", quiet)
+        say(f"{sheet}: {counted(len(widths), 'width')} side by side", quiet)
         return
     require(output is not None, "OUTPUT: expected an image or a stage file to write, found none")
     assert output is not None

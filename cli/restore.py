@@ -135,10 +135,11 @@ def restore(
         scheduler=scheduler,
         workers=workers,
     )
-    restoration, _ = restore_clip(order)
+    restoration, source = restore_clip(order)
     if json:
         # The truth is read again, so that it takes no memory while the stages run.
         facts = describe(restoration, None if truth is None else read_input_image(truth, selection.limits()))
-        print_json({"input": str(input), "output": str(output), "settings": str(order.settings_path), **facts})
+        paths = {"input": str(input), "output": str(output), "settings": str(order.settings_path)}
+        print_json({**paths, "warnings": list(source.warnings), **facts})
     else:
         say(summary(output, restoration), quiet)

@@ -9,6 +9,7 @@ import numpy as np
 from cyclopts import Parameter
 
 from turbrestore.core.errors import DataError, require
+from turbrestore.core.remarks import counted
 from turbrestore.deconvolution.deconvolve import Deconvolution
 from turbrestore.display.figure import new_figure
 from turbrestore.display.maps import plot_images
@@ -77,7 +78,7 @@ def centroid(
         found = finish(steps, step_counter(progress, "centroid", count * centroid.iterations))
     save_artifact(output, found, overwrite)
     sizes = ", ".join(f"{size:.2f}" for size in found.mean_flow_sizes)
-    say(f"{output}: centroid of {count} frames, mean flow {sizes} pixels", quiet)
+    say(f"{output}: centroid of {counted(count, 'frame')}, mean flow {sizes} pixels", quiet)
 
 
 def flow(
@@ -121,7 +122,10 @@ def flow(
             measured[...] = found
             count(found)
     write_flows(output, flows, image, source, reference, overwrite)
-    say(f"{output}: {len(flows)} flows, root mean square {float(np.sqrt(np.mean(flows**2))):.2f} pixels", quiet)
+    say(
+        f"{output}: {counted(len(flows), 'flow')}, root mean square {float(np.sqrt(np.mean(flows**2))):.2f} pixels",
+        quiet,
+    )
 
 
 def identify(
@@ -168,7 +172,7 @@ def identify(
         _plot_study(plot, study_prediction(measured, dynamics, machine.runtime()), overwrite, quiet)
     for note in found.notes:
         say(f"{output}: {note}", quiet)
-    say(f"{output}: {found.rank} states hold {100 * found.energy_share:.1f} % of the motion", quiet)
+    say(f"{output}: {counted(found.rank, 'state')} with {100 * found.energy_share:.1f} % of the motion", quiet)
 
 
 def predict(
@@ -299,7 +303,7 @@ def filter_(
         steps = filter_steps(source, start.image, model, filter, flow, start.flows, machine.runtime())
         filtered = finish(steps, observe).recentred()
     write_stage(output, filtered, source.bit_depth, overwrite)
-    say(f"{output}: {len(source)} frames filtered", quiet)
+    say(f"{output}: {counted(len(source), 'frame')} filtered", quiet)
 
 
 def _plot_study(plot: Path, study: PredictionStudy, overwrite: bool, quiet: bool) -> None:

@@ -16,6 +16,7 @@ from cyclopts import Parameter
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import ConfigurationError, require
+from turbrestore.core.remarks import counted
 from turbrestore.footage.checks.content import clean_source, keep_all
 from turbrestore.io.containers.encoding import BY_SUFFIX, Encoding, write_pipe
 from turbrestore.io.containers.stream import open_camera, open_pipe, read_raw, write_raw
@@ -284,10 +285,11 @@ class _Facts:
     def text(self) -> str:
         """One line for a person."""
         found = self.figures
-        blur = f"blur of {found.sigma:.2f} pixels removed" if found.sigma > 0 else "no blur removed"
+        count, moved = counted(len(found.moving), "frame"), float(np.mean(found.displacement))
+        blur = f" and {found.sigma:.2f} pixels of blur" if found.sigma > 0 else ""
         return (
-            f"{len(found.moving)} frames in {found.seconds:.1f} s, displacements of {np.mean(found.displacement):.2f} "
-            f"pixels and {blur}, {100 * np.mean(found.moving):.0f} % of the image moves{self._astray()}"
+            f"{count} in {found.seconds:.1f} s, with {moved:.2f} pixels of motion{blur} removed; "
+            f"{100 * np.mean(found.moving):.0f} % of the image moves{self._astray()}"
         )
 
     def _astray(self) -> str:

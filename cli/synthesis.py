@@ -19,6 +19,7 @@ from cyclopts import Parameter
 from turbrestore import __version__
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import ConfigurationError, OutputError, require, require_between
+from turbrestore.core.remarks import counted
 from turbrestore.io.images import read_image, write_image
 from turbrestore.io.limits import Limits
 from turbrestore.io.output import check_output, check_space
@@ -171,9 +172,8 @@ def synthesize(
         print_json({**facts, "output": str(output)})
     else:
         along_x, along_y = facts["flow_rms"]
-        say(
-            f"{output}: {frames} frames, displaced by {along_x:.2f} and {along_y:.2f} pixels along x and y (rms)", quiet
-        )
+        moved = f"displaced by {along_x:.2f} and {along_y:.2f} pixels along x and y (rms)"
+        say(f"{output}: {counted(frames, 'frame')}, {moved}", quiet)
 
 
 def _outputs(output: Path, has_diffraction: bool, has_objects: bool) -> dict[str, Path]:

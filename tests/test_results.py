@@ -54,6 +54,8 @@ def test_every_doubt_is_named(restoration):
         "motion that the flow has missed": {"seeing": missed},
         "as noisy as the average of 1.0 frames": {"filtered": replace(restoration.filtered, shares=np.eye(24)[0])},
         "100% of the pixels are saturated or seen in no frame": {"uncertainty": restoration.uncertainty + np.inf},
+        "cut short": {"decisions": (Decision("input", "", "cut short"),)},
+        "the flow model is overfitted": {"dynamics": replace(restoration.dynamics, overfitted=True)},
         "3% are at full scale": {"decisions": (Decision("saturation", "", "3% are at full scale"),)},
         "may have left traces": {"decisions": (Decision("moving objects", "", ""),)},
         "the frames contradict the filtered image": {"decisions": (Decision("structure", "", ""),)},

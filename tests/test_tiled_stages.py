@@ -246,7 +246,7 @@ def test_a_run_in_tiles_that_is_interrupted_ends_the_same(sequence, tiled, tmp_p
         with pytest.raises(KeyboardInterrupt):
             pipeline.restore(source, QUICK, store=kept)
     later = RunFolder(folder, source, QUICK, resume=True)
-    assert later.notes == (f"continues after the flow model and {finished} tiles of the filter",)
+    assert later.notes == (f"continues after the flow model and {finished} tile{'s' * (finished > 1)} of the filter",)
     told = []
     resumed = pipeline.restore(source, QUICK, store=later, progress=lambda stage, done, _: told.append((stage, done)))
     for name in ("image", "variance", "flow_states", "gains", "innovations", "sharpness", "shares"):
@@ -277,5 +277,5 @@ def test_a_damaged_tile_is_filtered_again(sequence, tmp_path, monkeypatch):
     notes = RunFolder(folder, source, QUICK, resume=True).notes
     assert notes == (
         "filtered_tile_0.npz is missing or damaged and is made again",
-        "continues after the flow model and 1 tiles of the filter",
+        "continues after the flow model and 1 tile of the filter",
     )

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from .agreement.sensor_pattern import without_stripes
 from .core.decision import Decision
+from .core.remarks import Doubt
 from .footage.background import without_moving_objects
 from .footage.bars import Bars, without_bars
 from .footage.levels import Levels, stretch_levels
@@ -60,6 +61,7 @@ def prepare(source: FrameSource, static_mask: str = "auto", scratch: Path | None
     survey, levels, range_decisions = stretch_levels(survey)
     clip, object_decisions = without_moving_objects(survey) if static_mask != "off" else (survey.clip, ())
     decisions = (
+        *(Decision("input", "used as read", found) for found in source.warnings if isinstance(found, Doubt)),
         *bar_decisions,
         *stripe_decisions,
         *overlay_decisions,

@@ -38,7 +38,7 @@ _FEW_FRAMES = 4
 # Share of pixels without information that is worth a look.
 _UNKNOWN = 0.01
 # Decisions that are a doubt about the image, whatever they choose.
-_DOUBTS = ("motion", "saturation")
+_DOUBTS = ("input", "motion", "saturation")
 
 
 class Store(Protocol):
@@ -246,6 +246,8 @@ def _checks(restoration: Restoration, motion: float, gain: float) -> Iterator[st
     if not restoration.centroid.converged:
         yield "the centroid has not converged"
     yield from (decision.reason for decision in restoration.decisions if decision.subject in _DOUBTS)
+    if restoration.dynamics is not None and restoration.dynamics.overfitted:
+        yield "the flow model is overfitted: too few flows for so many states"
     if any(decision.subject == "moving objects" for decision in restoration.decisions):
         yield "moving objects were replaced by the background and may have left traces"
     if restoration.seeing is not None and (doubt := restoration.seeing.disagreement):

@@ -9,6 +9,7 @@ import numpy as np
 from .blind.structure import LEFT, UNSEEN, StructureReading
 from .core.arrays import FloatArray
 from .core.decision import Decision
+from .core.remarks import counted
 from .dynamics.flow_model import FlowDynamics, mean_flow_error
 from .filtering.alternating import Filtered
 from .registration.camera.global_shift import DEAD_ZONE
@@ -86,7 +87,7 @@ def explain_centroid(centroid: Centroid) -> Decision:
     sizes = centroid.mean_flow_sizes
     return Decision(
         "centroid",
-        f"{sizes.size} iteration{'s' * (sizes.size > 1)}, {'' if centroid.converged else 'not '}converged",
+        f"{counted(sizes.size, 'iteration')}, {'' if centroid.converged else 'not '}converged",
         f"mean flow of {sizes[0]:.2f} pixels in the first iteration, {sizes[-1]:.2f} in the last",
     )
 
@@ -96,7 +97,7 @@ def explain_dynamics(dynamics: FlowDynamics, modelled: bool = False) -> tuple[De
     largest = float(abs(np.linalg.eigvals(dynamics.A)).max(initial=0.0))
     modes = Decision(
         "flow model",
-        f"{len(dynamics.A)} modes",
+        counted(len(dynamics.A), "state"),
         f"they hold {100 * dynamics.energy_share:.1f} % of the energy of the motion; the largest eigenvalue is "
         f"{largest:.3f}; frames are registered by {'the flow of the model' if modelled else 'the measured flow'}",
     )
@@ -114,7 +115,7 @@ def explain_frames(filtered: Filtered, chosen: int | None) -> Decision:
     mean = 1 / (count if chosen is None else chosen)
     counting = int(np.sum(filtered.shares >= _COUNTS * mean))
     reason = f"weighted by sharpness (β = {filtered.sharpness_weight:.1f}), registration and outliers"
-    reason += f"; a frame counts from {_COUNTS:g} times the average weight"
+    reason += f"; a frame counts if its weight is at least {_COUNTS:g} times the average"
     largest = f"the largest weight is {filtered.shares.max() / mean:.1f} times the average"
     asked = "" if chosen is None else f"; only the {chosen} sharpest were asked for"
     return Decision("frames", f"{counting} of {count} frames count", f"{reason}; {largest}{asked}")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
+from turbrestore.core.remarks import counted
 from turbrestore_cli.progress import TITLES
 
 from ..tab import Tab
@@ -72,7 +73,8 @@ class ProgressView:
         self._show_bars(job.bars.copy())
         self._show_decisions(job)
         self._stop.visible = state == "running"
-        self._state.text = f"Finished in {job.seconds:.1f} s." if state == "done" else _STATES[state]
+        done = f"Finished in {job.seconds:.1f} s. {job.message}"
+        self._state.text = done if state == "done" else _STATES[state]
         self._state.visible = True
         self._stages.visible = state != "done"
         self._ended = state != "running"
@@ -110,9 +112,8 @@ class ProgressView:
             for decision in decisions
         )
         shown = "" if job.state == "done" else " open"
-        head = "1 decision" if len(decisions) == 1 else f"{len(decisions)} decisions"
         content = (
-            f'<details class="decisions"{shown}><summary class="note">{head}</summary>'
+            f'<details class="decisions"{shown}><summary class="note">{counted(len(decisions), "decision")}</summary>'
             f'<dl class="decided">{"".join(lines)}</dl></details>'
         )
         self._decided.visible = bool(decisions)

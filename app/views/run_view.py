@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from nicegui import ui
 
 from turbrestore.core.errors import require
+from turbrestore.core.remarks import counted
 from turbrestore.settings import PRESETS
 from turbrestore_cli.options import Selection
 
@@ -153,7 +154,7 @@ class RunView:
 
     def _ranged(self) -> None:
         first, last = self._range()
-        self._count.text = f"{max(last - first, 0)} frames"
+        self._count.text = counted(max(last - first, 0), "frame")
         self._stacking.show_range(first, last)
 
     def _start(self, begin: Callable[[Order], Job[object]]) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from nicegui import events, ui
 
+from turbrestore.core.remarks import counted
 from turbrestore.footage.frame_selection import Share, best_frames
 from turbrestore.stacking.quality import QualityList, sort_by_quality
 
@@ -157,7 +158,7 @@ class StackingView:
             f'y="{height * (1 - value):.1f}" width="{max(step * 0.8, 0.3):.2f}" height="{value * height:.1f}"/>'
             for place, value in enumerate(ranked)
         )
-        label = f"Sharpness, sorted: {kept} of {len(quality)} frames are kept"
+        label = f"Sharpness, sorted: {kept} of {counted(len(quality), 'frame')} kept"
         self._graph.content = (
             f'<svg class="quality" viewBox="0 0 {width} {height}" preserveAspectRatio="none" role="img" '
             f'aria-label="{label}">{bars}<path class="level" d="M{kept * step:.1f} 0V{height}"/></svg>'

@@ -10,6 +10,7 @@ from html import escape
 from nicegui import ui
 
 from turbrestore.core.arrays import FloatArray
+from turbrestore.core.remarks import counted
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.display.preview import data_uri, encode_image
 from turbrestore.report.pictures import shown_range, to_levels
@@ -63,7 +64,7 @@ class SweepView:
             with self._sheet:
                 self._add(title, image, width, levels)
             seconds = asyncio.get_running_loop().time() - begun
-            self._note.text = f"{count} of {len(widths)} widths in {seconds:.1f} s. Press one to choose it."
+            self._note.text = f"{count} of {counted(len(widths), 'width')} in {seconds:.1f} s. Press one to choose it."
             if not self.filled:
                 self.filled = True
                 self._on_show()

@@ -282,7 +282,7 @@ class TestSeveral:
         assert (job.state, job.result, next(iter(job.images))) == ("done", None, "frame")
         assert [row.state for row in tab.rows] == ["failed", "done", "done"]
         assert tab.rows[0].words.startswith("cannot be opened as a video")
-        assert tab.rows[1].words.startswith("out/a.png, ")
+        assert tab.rows[1].words.startswith("out/a.png (") and "frames" in tab.rows[1].words
         # The frames of the clip that is open are not those of others.
         command = command_line(
             Order(tmp_path / "b.mkv", params=QUICK, preset="fast"), None, tmp_path / "b.mkv", tmp_path / "b.png"

@@ -237,6 +237,25 @@ class TestRestore:
         assert "alpha" in err
         assert read_image(tmp_path / "o.png").image.shape == (64, 64, 3)
 
+    def test_all_outputs_ask_to_check_the_same(self, run, tmp_path):
+        first, second = (make_sequence(seed=seed, count=count, size=64).frames for seed, count in ((33, 6), (34, 3)))
+        second = np.rot90(second, axes=(1, 2)) ** 3
+        stack = np.concatenate([first, second])
+        stack[3] = stack[2]
+        np.save(tmp_path / "two.npy", stack)
+        words = ["restore", tmp_path / "two.npy", tmp_path / "o.png", *QUICKEST[:-1], "--report", tmp_path / "o.html"]
+        code, _, err = run(*words)
+        assert code == 0
+        remark, doubt = (line.removeprefix("turbrestore: two.npy: ") for line in err.splitlines()[:2])
+        assert remark == "1 duplicated: frame 3 left out" and doubt.startswith("2 scenes: only the longest is used")
+        last = err.splitlines()[-1]
+        assert f"; check: {doubt}" in last and remark not in last
+        page = (tmp_path / "o.html").read_text("utf-8")
+        assert f"<li>{doubt}</li>" in page and f"Remark: {remark}" in page and f"Remark: {doubt}" not in page
+        record = json.loads(run(*words, "--json", "--overwrite")[1])
+        assert record["warnings"] == [remark, doubt]
+        assert last.endswith(f"; check: {'; '.join(record['verdict']['checks'])}")
+
     def test_overwrite_is_explicit(self, run, clip, tmp_path):
         output = tmp_path / "o.png"
         assert run("restore", clip, output, *QUICKEST)[0] == 0

@@ -126,7 +126,7 @@ def test_colour_picture_of_the_users_own(run, tmp_path):
         tmp_path / "own.png", tmp_path / "o.mkv", "--layers", "2", "--pupil-samples", "24", "--frames", 1
     )
     assert code == 0, err
-    assert "1 frames" in err
+    assert "1 frame, " in err
     assert open_frames(tmp_path / "o.mkv").shape == (1, 48, 64, 3)
     assert read_image(tmp_path / "o.truth.png").image == pytest.approx(picture, abs=1 / 250)
 

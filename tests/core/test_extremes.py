@@ -51,7 +51,7 @@ def far():
 CASES = {
     "two equal frames": (lambda: USUAL.frames[[0, 0]], "flow model", "the flows do not change over time: no states"),
     "no motion": (still, "flow model", "the flows do not change over time: no states"),
-    "motion of rank one": (one_direction, "flow model", "1 modes"),
+    "motion of rank one": (one_direction, "flow model", "1 state"),
     "fewer flows than states": (
         lambda: USUAL.frames[:4],
         "flow model",

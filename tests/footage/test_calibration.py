@@ -42,7 +42,7 @@ def test_offsets_and_gains_are_undone(dtype):
     assert source.bit_depth == clip.bit_depth and source.shape == clip.shape
     np.testing.assert_array_equal(source.select(roi=(3, 2, 9, 8)).read(), source.read()[:, 2:10, 3:12])
     (remark,) = source.warnings
-    assert "dark of dark (5 frames" in remark and "flat of flat (1 frames" in remark
+    assert "dark of dark (5 frames" in remark and "flat of flat (1 frame," in remark
 
 
 def test_each_alone():

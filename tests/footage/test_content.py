@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from conftest import make_sequence
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.footage.checks.content import ContentParams, check_content, clean_source, without_blank
+from turbrestore.footage.checks.stuck_pixels import StuckPixelDetector
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.pipeline import restore
@@ -195,6 +196,23 @@ class TestStuckPixels:
         ]
         report, _ = cleaned(np.clip(np.float32(stack), 0, 1))
         assert report.warnings == ()
+
+    def test_the_end_of_a_letter_is_kept_and_a_pixel_beside_an_edge_is_not(self):
+        def found():
+            detector = StuckPixelDetector(0.05)
+            for frame in stack:
+                detector.update(frame)
+            return detector.found().tolist()
+
+        stack = np.random.default_rng(0).uniform(0.2, 0.5, (20, 20, 20)).astype(np.float32)
+        stack[:, 4, 5] = 1
+        assert found() == [[4, 5]]
+        # A stroke covers half of a neighbour, which moves by the other half.
+        stack[:, 4, 4] = 0.5 + 0.5 * stack[:, 4, 4]
+        assert found() == []
+        # The edge of something bright stands out as much in every frame, but moves.
+        stack[:, 4, 4] = 0.76 + 0.15 * (-1) ** np.arange(20)
+        assert found() == [[4, 5]]
 
     def test_few_frames_tell_nothing(self, frames):
         stack = frames[:6].copy()

@@ -151,7 +151,8 @@ class TestAnimatedPng:
         part = open_frames(tmp_path / "a.png", frames=(1, 3))
         np.testing.assert_array_equal(part.read(), COLOUR[1:3] / np.float32(255))
         source = open_frames(tmp_path / "a.png", skip_damaged=True)
-        assert len(source) == 3 and source.warnings == ("cut short; only its first 3 frames are used",)
+        assert len(source) == 3
+        assert source.warnings == ("damaged or cut short after 3 whole frames; the others are missing",)
 
     def test_every_flipped_byte_of_the_pixels_is_found(self, tmp_path):
         data = animation(tmp_path / "a.png").read_bytes()

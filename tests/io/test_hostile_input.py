@@ -204,7 +204,7 @@ class TestSkippingDamage:
         (tmp_path / name).write_bytes(data[: int(0.6 * len(data))])
         source = open_frames(tmp_path / name, skip_damaged=True)
         assert 2 < len(source) < 12
-        assert source.warnings == (f"cut short; only its first {len(source)} frames are used",)
+        assert source.warnings == (f"cut short after {len(source)} whole frames; the others are missing",)
         np.testing.assert_array_equal(source.read(), whole[: len(source)])
 
     def test_nothing_whole_is_refused_all_the_same(self, tmp_path):

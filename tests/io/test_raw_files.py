@@ -37,7 +37,7 @@ def test_of_raw_and_jpeg_the_raw_file_is_read(tmp_path):
         write_dng(tmp_path / f"{number}.dng", MOSAIC + 100 * number)
         write_image(tmp_path / f"{number}.png", np.full((96, 128), 0.5), 8)
     source = open_frames(tmp_path)
-    assert source.shape == (3, 96, 128, 3) and source.warnings == ("3 shots are there as .dng and .png: .dng is read",)
+    assert source.shape == (3, 96, 128, 3) and source.warnings == ("3 shots found as .dng and .png: .dng is read",)
     assert np.diff(source.read().mean(axis=(1, 2, 3))).min() > 0.01
 
 

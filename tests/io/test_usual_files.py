@@ -95,7 +95,7 @@ class TestFolders:
             for suffix in ("tif", "png"):
                 write_image(tmp_path / f"IMG_{number}.{suffix}", SCENE[number], 8)
         source = open_frames(tmp_path)
-        assert len(source) == 3 and source.warnings == ("3 shots are there as .tif and .png: .tif is read",)
+        assert len(source) == 3 and source.warnings == ("3 shots found as .tif and .png: .tif is read",)
         (tmp_path / "IMG_1.tif").unlink()
         assert "as .tif and .png: .png is read" in open_frames(tmp_path).warnings[0]
 

@@ -12,6 +12,7 @@ import pytest
 
 from turbrestore.blind.guards import GuardReading
 from turbrestore.core.arrays import from_unit
+from turbrestore.core.decision import Decision
 from turbrestore.pipeline import restore
 from turbrestore.report import facts, render_report
 from turbrestore.runs.run_record import RunRecord
@@ -65,7 +66,7 @@ class TestPage:
         elements = Elements(page)
         assert elements.text["title"] == [f"{EVIL} – turbrestore"]
         assert "".join(elements.text["h1"]) == EVIL
-        assert "alpha channel <ignored>" in elements.text["li"]
+        assert "Remark: alpha channel <ignored>" in elements.text["p"]
         assert "95 % of the <motion>" in elements.text["td"]
         assert shlex.split("".join(elements.text["code"][:1])) == ["turbrestore", "restore", EVIL, "o.png"]
 
@@ -116,12 +117,12 @@ class TestPage:
 
     def test_doubts_stand_at_the_top(self, whole, run):
         sure = render_report(dataclasses.replace(whole, guard_readings=()), run)
-        doubted = dataclasses.replace(run, warnings=("1 duplicated: frame 3 left out",))
-        page = render_report(whole, doubted)
-        assert page.index("frame 3 left out") < page.index('<dl class="headline">')
-        assert page.count("frame 3 left out") == 1
+        doubt, remark = "cut short after 6 whole frames; the others are missing", "1 duplicated: frame 3 left out"
+        doubted = dataclasses.replace(whole, decisions=(Decision("input", "used as read", doubt),))
+        page = render_report(doubted, dataclasses.replace(run, warnings=(doubt, remark)))
+        assert page.index(f"<li>{doubt}</li>") < page.index(f"Remark: {remark}") < page.index('<dl class="headline">')
+        assert page.count(remark) == 1 and f"Remark: {doubt}" not in page
         assert "times as sharp as the mean of 6 frames" in sure
-        assert facts.verdict(whole, doubted).checks[0] == doubted.warnings[0]
 
     def test_settings_that_differ_are_marked(self, run):
         found = facts.settings(run)

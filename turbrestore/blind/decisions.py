@@ -44,18 +44,18 @@ def explain_posterior(posterior: BlurPosterior, removed: float) -> Decision:
         "the edges of the image": posterior.by_image,
     }
     witnesses = {name: found for name, found in witnesses.items() if np.isfinite(found).all()}
-    said = ", ".join(f"{name} {found[0]:.2f} to {found[2]:.2f}" for name, found in witnesses.items())
-    cause = "mostly by the air" if posterior.air > _MOSTLY else "by the air or the lens"
+    said = ", ".join(f"{found[0]:.2f} to {found[2]:.2f} from {name}" for name, found in witnesses.items())
+    cause = "caused mostly by the air" if posterior.air > _MOSTLY else "caused by the air or the lens"
     if posterior.air < 1 - _MOSTLY:
-        cause = "not by the air"
-    reason = f"{width:.2f} pixels, {low:.2f} to {high:.2f}, {cause}; expected from {said}"
+        cause = "not caused by the air"
+    reason = f"measured {width:.2f} pixels ({low:.2f} to {high:.2f}), {cause}; expected {said}"
     if posterior.edge_limited:
         reason = f"the edges of the image are too steep for more; {reason}"
     elif posterior.removed == 0:
         reason = f"no blur is certain enough; {reason}"
     outside = [name for name, found in witnesses.items() if found[0] > high or found[2] < low]
     if outside:
-        reason += f"; these disagree with the others: {' and '.join(outside)}"
+        reason += f"; outside the measured range: {' and '.join(outside)}"
     return Decision("blur", choice, reason)
 
 
@@ -80,7 +80,7 @@ def explain_guards(sigma: float, readings: tuple[GuardReading, ...], guards: Gua
     else:
         choice = "failed, kept because the width was given" if sigma > 0 else "failed at every width, no blur removed"
     reason = (
-        f"at {first.sigma:.2f} px {first.ringing:.0%} of edges ring (bound {guards.ringing:.0%}), "
+        f"at {first.sigma:.2f} px, {first.ringing:.0%} of edges ring (bound {guards.ringing:.0%}), "
         f"{first.overshoot:.0%} of pixels near edges overshoot (bound {guards.overshoot:.0%}), "
         f"noise × {first.noise_gain:.1f} (bound {guards.noise_gain:g})"
     )

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import DataError
+from .remarks import counted
 
 FloatArray = NDArray[np.float32]
 
@@ -56,7 +57,7 @@ def check_frames(frames: ArrayLike, name: str = "frames", at_least: int = 1) -> 
     if array.ndim not in (3, 4) or (array.ndim == 4 and array.shape[3] not in CHANNELS):
         raise DataError(f"{name}: expected shape (T, H, W) or (T, H, W, 3), found {array.shape}")
     if len(array) < at_least:
-        raise DataError(f"{name}: expected at least {at_least} frames, found {len(array)}")
+        raise DataError(f"{name}: expected at least {counted(at_least, 'frame')}, found {len(array)}")
     return _finite(array, name)
 
 

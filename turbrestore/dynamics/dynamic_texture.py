@@ -38,6 +38,7 @@ import numpy as np
 
 from ..core.arrays import FloatArray, check_flow
 from ..core.errors import DataError, require_between
+from ..core.remarks import counted
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import iter_slices, new_stack, to_scratch
 from ..runtime.threads import map_ahead, one_thread_each, sum_in_threads
@@ -225,9 +226,11 @@ def _notes(
     if present == 0:
         notes.append("the flows do not change over time: no states")
     if params.rank is not None and n < params.rank:
-        notes.append(f"{params.rank} states asked for, {n} independent flows found")
+        notes.append(f"{counted(params.rank, 'state')} asked for, {counted(n, 'independent flow')} found")
     if overfitted:
-        notes.append(f"{count} flows are few for {n} states: the system repeats them rather than describes them")
+        notes.append(
+            f"{count} flows are few for {counted(n, 'state')}: the system repeats them rather than describes them"
+        )
     if n == 0 and present > 0 and params.rank is None:
         notes.append(f"{count} flows are too few, or too noisy, for a state")
     largest = float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))

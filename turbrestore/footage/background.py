@@ -130,7 +130,7 @@ def without_moving_objects(survey: Survey) -> tuple[FrameSource, tuple[Decision,
         return source, ()
     model, placement = found
     background, share, touched = _average_background(source, model, placement)
-    reason = f"they cover {share:.1%} of the frames, and {touched:.0%} of the scene at some time"
+    reason = f"they cover {share:.1%} of a frame on average, and {touched:.0%} of the scene at some time"
     if model.excess is not None:
         reason += "; small ones such as snow or rain are among them"
     decision = Decision("moving objects", "replaced by the background", reason)

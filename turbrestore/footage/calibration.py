@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
 from ..core.errors import DataError
+from ..core.remarks import counted
 from ..io.output import size_text
 from ..io.pixels import PixelArray, planes_of, to_unit, with_planes
 from ..io.source import FrameSource
@@ -83,7 +84,8 @@ def make_calibration(clip: FrameSource, dark: FrameSource | None, flat: FrameSou
         spread = 1.4826 * np.median(np.abs(offset - np.median(offset)))
         bad |= offset > np.median(offset) + max(_HOT_DEVIATIONS * float(spread), _HOT_LEAST)
         remarks.append(
-            f"dark of {dark.name} ({len(dark)} frames, {_digest(offset)}) subtracted, {bad.sum()} hot pixels"
+            f"dark of {dark.name} ({counted(len(dark), 'frame')}, {_digest(offset)}) subtracted, "
+            f"{counted(int(bad.sum()), 'hot pixel')}"
         )
     if flat is not None:
         light = _values(flat, _average(clip, flat))
@@ -94,7 +96,8 @@ def make_calibration(clip: FrameSource, dark: FrameSource | None, flat: FrameSou
         gain = np.where(dead, 1, mean / np.where(dead, 1, light)).astype(np.float32)
         bad |= dead
         remarks.append(
-            f"flat of {flat.name} ({len(flat)} frames, {_digest(gain)}) divided out, {dead.sum()} dead pixels"
+            f"flat of {flat.name} ({counted(len(flat), 'frame')}, {_digest(gain)}) divided out, "
+            f"{counted(int(dead.sum()), 'dead pixel')}"
         )
     if bad.mean() > _MOST_BAD:
         raise DataError(

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from ..core.errors import DataError
+from ..core.remarks import counted
 from .astronomy.fits import open_fits_folder
 from .astronomy.fits_header import FITS_SUFFIXES, is_fits
 from .counts import source_of_numbers
@@ -38,7 +39,9 @@ def open_folder(folder: Path, limits: Limits) -> FrameSource:
         source = open_fits_folder(folder, files, limits)
         return dataclasses.replace(source, warnings=(*source.warnings, *remarks))
     if fits:
-        raise DataError(f"{folder}: expected images of one kind, found {fits} FITS files among {len(files)} images")
+        raise DataError(
+            f"{folder}: expected images of one kind, found {counted(fits, 'FITS file')} among {len(files)} images"
+        )
     first, notes = read_pixels(files[0], limits)
 
     def images(chosen: Sequence[int]) -> Iterator[PixelArray]:
@@ -96,7 +99,7 @@ def _one_of_each_shot(files: Sequence[Path]) -> tuple[list[Path], tuple[str, ...
     kept = [shot[chosen[id(shot)]] for shot in shots.values()]
     read = " or ".join(sorted({chosen[id(shot)] for shot in several}, key=_rank))
     there = " and ".join(sorted({suffix for shot in several for suffix in shot}, key=_rank))
-    return kept, (f"{len(several)} shots are there as {there}: {read} is read",)
+    return kept, (f"{counted(len(several), 'shot')} found as {there}: {read} is read",)
 
 
 def _rank(suffix: str) -> int:

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_image, from_unit, from_unit_to_type
 from ..core.errors import DataError, StorageError, TurbrestoreError
+from ..core.remarks import Doubt
 from .astronomy.fits import read_fits
 from .astronomy.fits_header import FITS_SUFFIXES, is_fits
 from .astronomy.fits_output import write_fits
@@ -158,7 +159,8 @@ def open_animation(path: Path, stop: int | None, limits: Limits, skip_damaged: b
             image.verify()
     is_16_bit = mode == "I;16"
     notes: tuple[str, ...] = ("alpha channel ignored",) if mode in ("LA", "RGBA") else ()
-    notes += ("16-bit values read as 8 bits",) if kind == "png" and data[_PNG_DEPTH] == 16 and not is_16_bit else ()
+    halved = kind == "png" and data[_PNG_DEPTH] == 16 and not is_16_bit
+    notes += (Doubt("16-bit values read as 8 bits"),) if halved else ()
     notes += ("variable frame rate",) if len(set(durations[:-1])) > 1 else ()
     notes += check_cut_short(path, present, stop, skip_damaged, "damaged or cut short") if present < count else ()
     times = np.cumsum([0.0, *durations[:-1]]) / 1000

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import CHANNELS, FloatArray, from_unit_to_type
 from ..core.errors import DataError
+from ..core.remarks import Doubt
 from ..runtime.scratch import iter_parts, new_stack
 from .counts import source_of_numbers
 from .limits import DEFAULT_LIMITS, Limits, check_input, format_errors, input_errors
@@ -129,7 +130,7 @@ def open_npy(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
     other more than its rows do.  A warning says how such an array was read.
     """
     array, order = _frames_first(path, map_npy(path))
-    remark = f"its axes are taken for {order}; save it as (T, H, W) or (T, H, W, 3) if that is wrong"
+    remark = Doubt(f"its axes are taken for {order}; save it as (T, H, W) or (T, H, W, 3) if that is wrong")
     notes = (remark,) if order else ()
     return source_of_numbers(
         path, f"npy/{array.dtype}", array.shape, array.dtype, MappedFrames.of(array), notes, limits

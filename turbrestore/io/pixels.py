@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
 from ..core.errors import DataError, require
+from ..core.remarks import Doubt
 
 PixelArray = NDArray[Any]
 
@@ -32,7 +33,7 @@ BAYER_CODES = {
     "gbrg": cv2.COLOR_BayerGBRG2RGB,
     "bggr": cv2.COLOR_BayerBGGR2RGB,
 }
-BAYER_REMARK = "pixels alternate as in a Bayer mosaic: --bayer rggb (or grbg, gbrg, bggr) gives colours"
+BAYER_REMARK = Doubt("pixels alternate as in a Bayer mosaic: --bayer rggb (or grbg, gbrg, bggr) gives colours")
 # Number of the tag of EXIF and TIFF that :func:`upright` takes.
 ORIENTATION_TAG = 274
 # In a mosaic neighbours differ by this factor more than the next pixels of their colour; in an image they differ less.

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.arrays import CHANNELS, FloatArray
 from ..core.errors import ConfigurationError, DataError, require
+from ..core.remarks import Doubt, counted
 from ..runtime.scratch import iter_frames
 from .output import size_text
 from .pixels import PixelArray, depth_of, full_scale_of, to_unit
@@ -53,7 +54,7 @@ class FrameSource:
     timestamps : ndarray, float64, shape (T,), or None
         Seconds since the first frame of the file, after the selection.
     warnings : tuple of str
-        What was left out, or is unusual.
+        What was left out, or is unusual; those that a person has to check are of the type :class:`Doubt`.
     damaged : tuple of int
         Numbers, in the file, of frames that are known to be damaged.
     levels : tuple of float or None
@@ -339,7 +340,7 @@ class FrameSource:
             done += 1
         if done < len(chosen):
             raise DataError(
-                f"{self.name}: expected {len(chosen)} frames, found {done}; the file is damaged or cut short"
+                f"{self.name}: expected {counted(len(chosen), 'frame')}, found {done}; the file is damaged or cut short"
             )
 
 
@@ -367,14 +368,15 @@ def check_cut_short(
 
     The other frames may be missing if ``skip_damaged`` is true, or if frames from ``stop`` on are not needed.
     """
+    found = f"{problem} after {counted(intact, 'whole frame')}"
     if skip_damaged and intact:
-        return (f"cut short; only its first {intact} frames are used",)
+        return (Doubt(f"{found}; the others are missing"),)
     if stop is not None and stop <= intact:
         return ()
     if intact < 1:
         raise DataError(f"{path}: {problem} before the end of the first frame; copy the file again")
     remedy = f"copy the file again or select frames up to {intact}"
-    raise DataError(f"{path}: {problem} after {intact} whole frames; {remedy}")
+    raise DataError(f"{path}: {found}; {remedy}")
 
 
 def numbers_text(numbers: Collection[int]) -> str:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, from_unit_to_type
 from ..core.errors import DataError
+from ..core.remarks import counted
 from .counts import source_of_numbers
 from .limits import DEFAULT_LIMITS, Limits, format_errors, input_errors
 from .npy import MappedFrames
@@ -63,12 +64,14 @@ def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
             return source_of_numbers(path, form, packed.shape, packed.dtype, MappedFrames.of(packed), (), limits)
         channels, planes = _channels(page), _plane_pages(path, tiff, count, whole)
         if channels is None:
-            kind = f"{getattr(page.photometric, 'name', page.photometric)} with {page.samplesperpixel} channels"
+            kind = (
+                f"{getattr(page.photometric, 'name', page.photometric)} with {counted(page.samplesperpixel, 'channel')}"
+            )
             raise DataError(f"{path}: expected grey or RGB pages, found {kind}; convert the file")
         dtype, bits, notes = np.dtype(page.dtype), page.bitspersample, _notes(page)
         if count > len(whole):
             reduced = count - len(whole)
-            notes += (f"{reduced} page{'s' * (reduced > 1)} of reduced size left out",)
+            notes += (f"{counted(reduced, 'page')} of reduced size left out",)
         source = source_of_numbers(
             path,
             f"tiff/{dtype}",
@@ -130,7 +133,7 @@ def _list_pages(path: Path, tiff: tifffile.TiffFile, limits: Limits) -> tuple[in
     # tifffile ignores a link that leads to no page.
     tiff.filehandle.seek(tiff.pages.next_page_offset or 0)
     if tiff.filehandle.read(tiff.tiff.offsetsize) != bytes(tiff.tiff.offsetsize):
-        raise DataError(f"{path}: cut short after {len(seen)} whole pages; copy the file again")
+        raise DataError(f"{path}: cut short after {counted(len(seen), 'whole page')}; copy the file again")
     return len(seen), whole or list(range(len(seen)))
 
 

@@ -26,6 +26,7 @@ import numpy as np
 
 from ..core.arrays import FloatArray, check_image
 from ..core.errors import DataError, require
+from ..core.remarks import Doubt
 from .astronomy.fits import open_fits
 from .astronomy.fits_header import FITS_SUFFIXES, is_fits
 from .astronomy.ser import open_ser, write_ser
@@ -108,7 +109,7 @@ def open_frames(
     source = _open(Path(path), frames, limits, skip_damaged, hdr == "keep")
     source = source if bayer is None else _as_bayer(source, bayer)
     source = source.select(frames, roi)
-    source = source.without(source.damaged, f"checksum fails: {numbers_text(source.damaged)} left out")
+    source = source.without(source.damaged, Doubt(f"checksum fails: {numbers_text(source.damaged)} left out"))
     # Only the reader of a container sets a colour.  It has decoded the first frame of the file, and no frame of a video
     # is beyond full scale.
     if source.colour is None:

@@ -32,6 +32,7 @@ class ClipRow:
     height: int = 0
     blur: float = 0.0  # width of the blur that was removed, pixels
     seconds: float = 0.0  # time of all stages
+    checks: str = ""  # what a person has to check
     remarks: str = ""  # what was repaired, left out or unusual
     # Pictures of a frame and of the result, as data URIs.
     before: str = ""

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..results import Restoration, Verdict
+from ..core.remarks import counted
+from ..results import Restoration
 from ..runs.run_record import RunRecord
 from ..settings import RestoreParams
 from ..wording import interval_words
@@ -92,13 +93,6 @@ def findings(restoration: Restoration) -> list[Fact]:
     ]
 
 
-def verdict(restoration: Restoration, run: RunRecord) -> Verdict:
-    """Return the verdict on a restoration, whose checks begin with the remarks of the reader and of the flow model."""
-    found = restoration.verdict
-    notes = () if restoration.dynamics is None else restoration.dynamics.notes
-    return dataclasses.replace(found, checks=(*run.warnings, *notes, *found.checks))
-
-
 def settings(run: RunRecord, defaults: Mapping[str, Any] | None = None) -> list[Setting]:
     """Return all settings, named as on the command line, with dots between the levels."""
     usual = dict(_flat({**_USUAL_RUN, **dataclasses.asdict(RestoreParams())} if defaults is None else defaults))
@@ -120,9 +114,10 @@ def laps(restoration: Restoration) -> list[Lap]:
 
 def _motion_facts(restoration: Restoration) -> Iterator[Fact]:
     centroid, dynamics = restoration.centroid, restoration.dynamics
+    iterations = counted(centroid.mean_flow_sizes.size, "iteration")
     yield Fact(
         "Centroid",
-        f"{centroid.mean_flow_sizes.size} iterations, {centroid.mean_flow_sizes[-1]:.2f} px mean flow remaining",
+        f"{iterations}, {centroid.mean_flow_sizes[-1]:.2f} px mean flow remaining",
         "converged" if centroid.converged else "not converged: allow more iterations",
         not centroid.converged,
     )
@@ -130,7 +125,7 @@ def _motion_facts(restoration: Restoration) -> Iterator[Fact]:
         return
     yield Fact(
         "Flow model",
-        f"{dynamics.rank} states, {100 * dynamics.energy_share:.1f} % of the motion",
+        f"{counted(dynamics.rank, 'state')}, {100 * dynamics.energy_share:.1f} % of the motion",
         "overfitted: too few flows for so many states" if dynamics.overfitted else f"of {dynamics.frame_count} flows",
         dynamics.overfitted,
     )
@@ -171,7 +166,9 @@ def _blur_facts(restoration: Restoration) -> Iterator[Fact]:
         yield Fact("Noise before deblurring", f"{100 * done.noise:.2f} %", "of full scale")
         if done.sigma > 0:
             note = "converged" if done.converged else "not converged: allow more iterations"
-            value = f"{done.sigma:.2f} px removed in {done.iterations} iterations, fidelity {done.fidelity:.0f}"
+            value = (
+                f"{done.sigma:.2f} px removed in {counted(done.iterations, 'iteration')}, fidelity {done.fidelity:.0f}"
+            )
             yield Fact("Deconvolution", value, note, not done.converged)
 
 
@@ -190,7 +187,7 @@ def _seeing_facts(restoration: Restoration) -> Iterator[Fact]:
     notes = {
         "displacement_variance": "per axis, over a long time; 95 % interval",
         "displacement_by_flow": "over this clip",
-        "displacement_by_blur": "over this clip, from the blur of the mean; a lower bound above 2 px²",
+        "displacement_by_blur": "over this clip, from the blur of the mean; above 2 px² it is a lower bound",
         "isoplanatic_patch": "separation at which the motion is half correlated",
         "coherence_time": "lag at which the correlation of the motion falls to 1/e",
     }

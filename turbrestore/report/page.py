@@ -18,7 +18,7 @@ from ..io.output import atomic_write, check_output
 from ..results import Restoration
 from ..runs.run_record import RunRecord
 from .comparison import comparison, environment, text_file
-from .facts import findings, headline, laps, settings, verdict
+from .facts import findings, headline, laps, settings
 from .panels import draw_panels
 from .pictures import encode_gallery, stages
 
@@ -91,7 +91,7 @@ def render_report(restoration: Restoration, run: RunRecord) -> str:
         groups=[[panel for panel in panels if panel.is_map == wanted] for wanted in (True, False)],
         headline=headline(restoration),
         findings=findings(restoration),
-        verdict=verdict(restoration, run),
+        verdict=restoration.verdict,
         settings=settings(run),
         laps=laps(restoration),
         command=shlex.join(run.command),

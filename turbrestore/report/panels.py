@@ -94,7 +94,7 @@ def _dynamics(dynamics: FlowDynamics) -> Iterator[Panel]:
     caption = f"Coloured: the states of the flow model, which hold {100 * dynamics.energy_share:.1f} % of the variance."
     yield make_panel(figure, "singular", "Singular values of the flows", caption)
     figure = plot_eigenvalues(dynamics.eigenvalues)
-    caption = "Inside the circle motion decays. If all lie on it, the model only repeats the training flows."
+    caption = "Inside the circle, motion decays. If all values lie on it, the model only repeats the training flows."
     yield make_panel(figure, "eigen", "Eigenvalues of the transition matrix and the unit circle", caption)
 
 

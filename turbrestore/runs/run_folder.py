@@ -25,6 +25,7 @@ from ..blur.estimation import BlurEstimate
 from ..blur.posterior import BlurPosterior
 from ..core.arrays import check_image
 from ..core.errors import DataError, OutputError, require
+from ..core.remarks import counted
 from ..deconvolution.deconvolve import Deconvolution
 from ..filtering.filter_records import FilterCheckpoint
 from ..footage.levels import Levels
@@ -149,8 +150,8 @@ class RunFolder:
         words = f"after the {last[0]}" if last else "from the start"
         tiles = _tiles(self._record.files)
         if tiles:
-            return f"{words} and {len(tiles)} tiles of the filter"
-        return f"{words} and {self._written} frames of the filter" if self._written else words
+            return f"{words} and {counted(len(tiles), 'tile')} of the filter"
+        return f"{words} and {counted(self._written, 'frame')} of the filter" if self._written else words
 
     def withdraw(self) -> None:
         """Remove the record of a run that failed before it stored a result."""

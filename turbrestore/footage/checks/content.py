@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from ...core.arrays import FloatArray
 from ...core.decision import Decision
 from ...core.errors import ConfigurationError, DataError, require_between
+from ...core.remarks import Doubt, counted
 from ...io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
 from ...io.source import FrameSource, numbers_text
 from .black_borders import BlackBorderDetector
@@ -329,17 +330,16 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
         return ["every frame is of one intensity: there is no scene"]
     lines = []
     if report.filled:
-        values = "value" if report.filled_values == 1 else "values"
         where = numbers_text(report.filled)
         how = "from around" if report.backdrop is None else _how_filled(report)
-        lines.append(f"{report.filled_values} NaN or infinite {values} in {where}: filled {how}")
+        lines.append(f"{counted(report.filled_values, 'NaN or infinite value')} in {where}: filled {how}")
     if report.backdrop is not None and report.backdrop.black_borders:
         lines.append("black borders that change from frame to frame: filled by what other frames show")
     if len(report.stuck):
         places = "; ".join(f"x {place[1]}, y {place[0]}" for place in report.stuck[:3])
+        places += "; …" * (len(report.stuck) > 3)
         lines.append(
-            f"{len(report.stuck)} stuck pixels ({places}{'; …' * (len(report.stuck) > 3)}): replaced by the "
-            "median of their neighbours"
+            f"{counted(len(report.stuck), 'stuck pixel')} ({places}): replaced by the median of the neighbours"
         )
     if report.blank:
         lines.append(f"{len(report.blank)} blank: {numbers_text(report.blank)} left out")
@@ -350,10 +350,9 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
     if len(report.scenes) > 1:
         longest = max(report.scenes, key=lambda scene: scene.count)
         others = ", ".join(f"{scene.first}:{scene.last + 1}" for scene in report.scenes if scene is not longest)
-        lines.append(
-            f"{len(report.scenes)} scenes: only the longest is used, {longest.count} frames from {longest.first} to "
-            f"{longest.last}; to use another, select its frames ({others})"
-        )
+        used = f"{counted(longest.count, 'frame')} from {longest.first} to {longest.last}"
+        choice = f"only the longest is used, {used}; to use another, select its frames ({others})"
+        lines.append(Doubt(f"{len(report.scenes)} scenes: {choice}"))
     if report.saturated >= _SATURATED:
         lines.append(f"{100 * report.saturated:.0f} % of the values are at white: detail there is lost")
     return lines

@@ -1,9 +1,9 @@
 """Detection and repair of hot and dead pixels.
 
 A stuck pixel differs from a small detail of the scene in one of two ways: its neighbours show nothing of it, although a
-lens and motion would spread a detail; or it never changes while its neighbours do. Pairs, clusters, pixels at the
-border, and pixels that a lossy codec has spread are not found.  Those of a Bayer sensor are looked for in its mosaic,
-among the neighbours of their colour.
+lens and motion would spread a detail; or it never changes while its neighbours do.  So does the end of a letter of a
+title, but the letter covers part of a neighbour.  Pairs, clusters, pixels at the border, and pixels that a lossy codec
+has spread are not found.  Those of a Bayer sensor are looked for in its mosaic, among the neighbours of their colour.
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ _FEWEST_FRAMES = 10
 _DENSE_FRAMES = 8
 # A lone pixel exceeds its highest neighbour by this share of its distance from the median of all neighbours.
 _ALONE = 0.8
-# Largest change of a stuck pixel, least mean change of its neighbours, and still neighbours that make it a letter.
-_STILL, _MOVING, _OF_LETTER = 1.5 / 255, 8 / 255, 1
+# Largest change of a stuck pixel, and least mean change of its neighbours.
+_STILL, _MOVING = 1.5 / 255, 8 / 255
+# Share of its distance from the median of all neighbours that one of them has in every frame, if both are of a letter.
+_OF_LETTER = 0.3
 _RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 _AROUND = np.array([(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)])
 
@@ -56,8 +58,11 @@ class StuckPixelDetector:
         moves = self._highest - self._lowest
         moved = moves.mean(axis=1) >= _MOVING
         still = (self._most - self._least <= _STILL) & moved
-        # A neighbour that is stuck too, while others move, is part of a letter of a title.
-        letter = moved & ((moves <= _STILL).sum(axis=1) >= _OF_LETTER)
+        # A letter of a title covers a neighbour, which is still while others move, or a share of one, which stands out
+        # by that share in every frame, and moves by the rest.
+        left = (1 - self._shared) * moves.max(axis=1, keepdims=True) + _STILL
+        covered = (self._shared >= _OF_LETTER) & (moves <= left)
+        letter = moved & ((moves <= _STILL) | covered).any(axis=1)
         stuck = self._places[(still | (self._alone >= _ALONE)) & ~letter]
         return none if len(stuck) > _MOST_STUCK * self._size else stuck
 
@@ -82,15 +87,17 @@ class StuckPixelDetector:
         self._searching, self._high, self._low = False, None, None
         own, around = _with_neighbours(values, self._places)
         self._least, self._most, self._lowest, self._highest = own, own, around, around
-        self._alone = np.full(len(own), np.inf, np.float32)
+        self._alone, self._shared = np.full(len(own), np.inf, np.float32), np.full_like(around, np.inf)
 
     def _follow(self, values: FloatArray) -> None:
         own, around = _with_neighbours(values, self._places)
         sign = self._sign[:, None]
         over = (sign * (own[:, None] - around)).min(axis=1)
         keep = over > self._excess
-        height = np.abs(own - np.median(around, axis=1))
-        self._alone = np.minimum(self._alone, over / np.maximum(height, self._excess))[keep]
+        middle = np.median(around, axis=1, keepdims=True)
+        height = np.maximum(np.abs(own[:, None] - middle), self._excess)
+        self._alone = np.minimum(self._alone, over / height[:, 0])[keep]
+        self._shared = np.minimum(self._shared, sign * (around - middle) / height)[keep]
         self._places, self._sign = self._places[keep], self._sign[keep]
         self._least, self._most = np.minimum(self._least, own)[keep], np.maximum(self._most, own)[keep]
         self._lowest = np.minimum(self._lowest, around)[keep]

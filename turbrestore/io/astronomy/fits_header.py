@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from ...core.errors import DataError
 from ...core.extras import missing_package
+from ...core.remarks import Doubt
 from ..limits import Limits, check_input, format_errors, input_errors
 from ..pixels import BAYER_CODES
 
@@ -199,7 +200,7 @@ def _image(path: Path, cards: list[str], header: Header, offset: int) -> FitsIma
     pattern = str(header.get("BAYERPAT", "")).strip()
     bayer = _first_colours(pattern, header, shape[-2] if bottom_up and len(shape) > 1 else None)
     if pattern and bayer is None:
-        notes.append(f"the Bayer pattern {pattern} is unknown, so it is not made into colour")
+        notes.append(Doubt(f"the Bayer pattern {pattern} is unknown, so it is not made into colour"))
     missing = blank if dtype.kind in "iu" and isinstance(blank, int) else None
     name = re.sub(r"[\s_-]*\d*$", "", str(header.get("EXTNAME", "")).strip().upper())
     return FitsImage(path, tuple(cards), shape, dtype, offset, (scale, zero), missing, tuple(notes), bayer, name)
