@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -115,15 +116,25 @@ class Title:
         mask = self.mask[relative_window(self.window, window)]
         return continued(values, ~mask) if mask.any() else values
 
+    @cached_property
+    def _pixels(self) -> tuple[FloatArray, FloatArray, NDArray[np.int32]]:
+        """Luminance, gradient and number of the part, from 1, of every pixel of the title."""
+        grey = luminance(self.frame)
+        labels = cv2.connectedComponents(self.mask.astype(np.uint8), connectivity=8)[1]
+        return grey[self.mask], np.hypot(*sobel_gradient(grey))[self.mask], labels[self.mask]
+
     def at_rest(self, frame: FloatArray, noise: float) -> Title | None:
         """Keep the parts whose edges have not moved: blocks that a coder copies look drawn for a while."""
-        before = luminance(self.frame)
-        gradient = np.hypot(*sobel_gradient(before))
-        edges = self.mask & (gradient > _DEVIATIONS * noise)
-        moved = edges & (np.abs(luminance(frame) - before) > _MOTION * gradient)
-        count, labels = cv2.connectedComponents(self.mask.astype(np.uint8), connectivity=8)
-        of_all, gone = (np.bincount(labels[pixels], gradient[pixels] ** 2, count) for pixels in (edges, moved))
-        mask = self.mask & (gone <= _MOVED * of_all)[labels]
+        before, gradient, parts = self._pixels
+        edges = gradient > _DEVIATIONS * noise
+        moved = edges & (np.abs(luminance(frame)[self.mask] - before) > _MOTION * gradient)
+        count = int(parts.max()) + 1
+        of_all, gone = (np.bincount(parts[pixels], gradient[pixels] ** 2, count) for pixels in (edges, moved))
+        still = gone <= _MOVED * of_all
+        if still.all():
+            return self
+        mask = self.mask.copy()
+        mask[mask] = still[parts]
         return replace(self, mask=mask) if mask.any() else None
 
     def put_back(self, image: FloatArray, left: int = 0, top: int = 0) -> FloatArray:
