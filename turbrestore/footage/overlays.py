@@ -216,11 +216,11 @@ def _static_regions(
     mean, noise, deviation = luminance(moments.mean), moments.noise, np.sqrt(moments.variance)
     floor = max(_STILL * noise, _LEAST_STILL)
     still = deviation < floor
-    slopes = sobel_gradient(mean)
-    gradient = np.hypot(*slopes)
+    gradient = np.hypot(*sobel_gradient(mean))
     clear = gradient > _DEVIATIONS / _STILL * floor
     motion = measured = _motion(deviation[clear], gradient[clear], noise)
     if shifts is not None:
+        slopes = sobel_gradient(mean)
         across = np.einsum("iyx,ij,jyx->yx", slopes, np.cov(shifts.T), slopes)
         motion = np.minimum(measured, np.sqrt(np.maximum(across, 0)) / np.maximum(gradient, 1e-6))
     edges = still & clear & (gradient * np.minimum(_STATIC * motion, 1.0) > deviation)
@@ -249,10 +249,10 @@ def _titles(drawn: NDArray[np.bool_], clear: NDArray[np.bool_]) -> NDArray[np.bo
     A dark line along the border, a pixel or two wide, is no title.
     """
     count, labels = cv2.connectedComponents(_with_gaps(drawn), connectivity=8)
-    beside = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8)).astype(int)
+    beside = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8))
     inner = np.zeros_like(drawn)
     inner[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
-    found, all_edges = (np.bincount(beside[pixels & inner], minlength=count) for pixels in (drawn, clear))
+    found, all_edges = (np.bincount(beside[pixels & inner].astype(int), minlength=count) for pixels in (drawn, clear))
     many = (found >= _FEWEST_STROKES) & (found >= _LEAST_DRAWN * all_edges)
     many[0] = False
     return drawn & _around(many[labels], len(drawn) // _LINE)
@@ -261,7 +261,8 @@ def _titles(drawn: NDArray[np.bool_], clear: NDArray[np.bool_]) -> NDArray[np.bo
 def _digits(source: FrameSource, moments: Moments, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mark strokes that stay from one frame to the next, and change at times; with the gaps between them."""
     same, clear = max(_SAME * moments.noise, _LEAST_SAME), _DEVIATIONS * max(moments.noise, _LEAST_STILL / _STILL)
-    edges, static = np.zeros((2, *source.shape[1:3]), np.int32)
+    # Less than twice as many frames are looked at, so that a byte counts them.
+    edges, static = np.zeros((2, *source.shape[1:3]), np.uint8)
     part, before = source.select((0, len(source), max(1, len(source) // _LOOKED_AT))), None
     for frame in part:
         grey = luminance(frame)
@@ -274,7 +275,7 @@ def _digits(source: FrameSource, moments: Moments, mask: NDArray[np.bool_]) -> N
     moving = (edges >= _OFTEN * (len(part) - 1)) & (moments.variance > (_STILL * same) ** 2)
     if not moving.any():
         return moving
-    share = np.where(moving, static / np.maximum(edges, 1), 0)
+    share = np.where(moving, np.divide(static, np.maximum(edges, 1), dtype=np.float64), 0)
     # Where the scene hardly moves, its edges stay at times as well.
     usual = max(float(np.quantile(share[moving], 0.9)) / _USUAL, 1.0)
     share[static < _TIMES] = 0

@@ -77,23 +77,30 @@ class Moments:
 
 def measure_moments(survey: Survey) -> Moments:
     """Take the moments of the whole frames of a survey."""
-    shape = survey.clip.shape[1:]
-    total, sums, noise = np.zeros(shape), np.zeros((3, *shape[:2])), []
+    shape, colour = survey.clip.shape[1:], len(survey.clip.shape) == 4
+    sums, noise = np.zeros((3, *shape[:2])), list[float]()
+    total = np.zeros(shape) if colour else sums[0]
     before: FloatArray | None = None
     for frame in survey:
         grey = luminance(frame)
         if before is not None:
             cv2.accumulateSquare(grey - before, sums[2])
         before = grey
-        cv2.accumulate(frame, total)
+        if colour:
+            cv2.accumulate(frame, total)
         cv2.accumulate(grey, sums[0])
         cv2.accumulateSquare(grey, sums[1])
         noise.append(estimate_noise(grey))
     count = len(survey.numbers)
-    change = (sums[2] / (2 * max(count - 1, 1))).astype(np.float32)
-    sums /= count
-    variance = np.maximum(sums[1] - np.square(sums[0]), 0).astype(np.float32)
-    return Moments((total / count).astype(np.float32), variance, change, float(np.median(noise)), count)
+    # In place, because a search for overlays takes most memory here.
+    sums[:2] /= count
+    if colour:
+        total /= count
+    mean = total.astype(np.float32)
+    sums[1] -= np.square(sums[0], out=sums[0])
+    variance = np.maximum(sums[1], 0, out=sums[1]).astype(np.float32)
+    sums[2] /= 2 * max(count - 1, 1)
+    return Moments(mean, variance, sums[2].astype(np.float32), float(np.median(noise)), count)
 
 
 def survey_memory(shape: tuple[int, ...], in_scratch: bool) -> float:
