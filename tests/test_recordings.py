@@ -179,8 +179,9 @@ class TestOverlays:
     def test_a_window_is_that_of_the_whole_frame(self, shaken):
         covered = shaken.copy()
         covered[:, 40, 20:60] = 255
-        source, _, _, _ = without_overlay(surveyed(covered))
-        source = source.clip
+        survey = surveyed(covered)
+        assert without_overlay(survey, titles_only=True) == (survey, None, None, ())
+        source = without_overlay(survey)[0].clip
         part = source.select((2, 5), (15, 30, 30, 25))
         np.testing.assert_array_equal(part.read(), source.read(2, 5)[:, 30:55, 15:45])
 

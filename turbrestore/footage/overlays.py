@@ -165,13 +165,13 @@ def read_static_mask(path: str | os.PathLike[str], source: FrameSource) -> NDArr
 
 
 def without_overlay(
-    survey: Survey, mask: NDArray[np.bool_] | None = None, moments: Moments | None = None
+    survey: Survey, mask: NDArray[np.bool_] | None = None, moments: Moments | None = None, titles_only: bool = False
 ) -> tuple[Survey, NDArray[np.bool_] | None, Title | None, tuple[Decision, ...]]:
     """Replace the static overlay of a clip; frames without one are returned as they are.
 
     Return the frames, the pixels (H, W) of the scene that no frame shows, the title that has to be put back into
     results because the camera is static as well, and the decisions. ``mask`` (H, W) names the pixels that are replaced;
-    ``moments`` are those of the survey, if they are known.
+    ``moments`` are those of the survey, if they are known.  With ``titles_only``, what a moving camera shows stays.
     """
     given, title = mask is not None, None
     if mask is None and FEWEST <= len(survey.small) <= _MOST:
@@ -190,6 +190,8 @@ def without_overlay(
         choice = f"{100 * float(title.mask.mean()):.1f} % of the frame kept as in the mean of the frames"
         reason = "it is static while the air bends the scene around it; it is neither moved nor deblurred"
         return survey.adjusted(title.without, small), title.mask, title, (Decision("overlay", choice, reason),)
+    if titles_only:
+        return survey, None, None, ()
     if moments is not None and not given:
         mask, _ = _static_regions(survey.clip, moments, shifts)
         if mask is None:

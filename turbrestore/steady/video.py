@@ -212,7 +212,7 @@ class _Scenes:
             bit_depth=8,
             pixels=lambda chosen: (np.clip(luminance(images[number]), 0, 1) for number in chosen),
         )
-        self._title = without_overlay(take_survey(clip))[2]
+        self._title = without_overlay(take_survey(clip), titles_only=True)[2]
 
     def estimate(self, frame: DewarpedFrame) -> tuple[Memory, NDArray[np.bool_], float, Title | None]:
         """Estimate of the scene at a frame, what moves, the width of the blur of what is remembered, and the title."""
