@@ -77,30 +77,27 @@ class Moments:
 
 def measure_moments(survey: Survey) -> Moments:
     """Take the moments of the whole frames of a survey."""
-    shape, colour = survey.clip.shape[1:], len(survey.clip.shape) == 4
+    shape = survey.clip.shape[1:]
     sums, noise = np.zeros((3, *shape[:2])), list[float]()
-    total = np.zeros(shape) if colour else sums[0]
+    total = sums[0] if len(shape) == 2 else np.zeros(shape)
     before: FloatArray | None = None
     for frame in survey:
         grey = luminance(frame)
         if before is not None:
             cv2.accumulateSquare(grey - before, sums[2])
         before = grey
-        if colour:
-            cv2.accumulate(frame, total)
         cv2.accumulate(grey, sums[0])
         cv2.accumulateSquare(grey, sums[1])
+        if len(shape) == 3:
+            cv2.accumulate(frame, total)
         noise.append(estimate_noise(grey))
     count = len(survey.numbers)
-    # In place, because a search for overlays takes most memory here.
-    sums[:2] /= count
-    if colour:
-        total /= count
-    mean = total.astype(np.float32)
+    # Without temporary arrays: the search for overlays takes most memory here.
+    mean = np.divide(total, count, out=np.empty(shape, np.float32), casting="same_kind")
+    sums /= np.reshape([count, count, 2 * max(count - 1, 1)], (3, 1, 1))
     sums[1] -= np.square(sums[0], out=sums[0])
-    variance = np.maximum(sums[1], 0, out=sums[1]).astype(np.float32)
-    sums[2] /= 2 * max(count - 1, 1)
-    return Moments(mean, variance, sums[2].astype(np.float32), float(np.median(noise)), count)
+    variance, change = np.maximum(sums[1:], 0, out=sums[1:]).astype(np.float32)
+    return Moments(mean, variance, change, float(np.median(noise)), count)
 
 
 def survey_memory(shape: tuple[int, ...], in_scratch: bool) -> float:

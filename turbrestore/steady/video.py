@@ -203,14 +203,10 @@ class _Scenes:
     def keep_title(self, window: Window) -> None:
         """Keep the title that a static camera has drawn over the frames of a window, as long as it is there."""
         images = [frame.image for _, frame in sorted({0: window.frame, **window.neighbours}.items())]
+        shape = (len(images), *images[0].shape[:2])
         # Nothing says how many bits a stream has, nor is it held to the range that a clip is.
         clip = FrameSource(
-            name="stream",
-            format="array",
-            file_shape=(len(images), *images[0].shape[:2]),
-            full_scale=1,
-            bit_depth=8,
-            pixels=lambda chosen: (np.clip(luminance(images[number]), 0, 1) for number in chosen),
+            "stream", "array", shape, 1, 8, lambda chosen: (np.clip(luminance(images[k]), 0, 1) for k in chosen)
         )
         self._title = without_overlay(take_survey(clip), titles_only=True)[2]
 
