@@ -178,10 +178,11 @@ class TestOverlays:
 
     def test_a_window_is_that_of_the_whole_frame(self, shaken):
         covered = shaken.copy()
-        covered[:, 40, 20:60] = 255
+        covered[:, 40:44, 20:60] = 255
         survey = surveyed(covered)
         assert without_overlay(survey, titles_only=True) == (survey, None, None, ())
         source = without_overlay(survey)[0].clip
+        assert (source.read()[:, 41:43, 22:58] < 1).any()
         part = source.select((2, 5), (15, 30, 30, 25))
         np.testing.assert_array_equal(part.read(), source.read(2, 5)[:, 30:55, 15:45])
 
@@ -231,6 +232,22 @@ class TestTitles:
         noise = np.random.default_rng(1).normal(0, 2, titled.shape)
         still = np.where(titled[0] == 255, 255, np.clip(titled[0] + noise, 0, 250)).astype(np.uint8)
         assert without_overlay(surveyed(still))[2] is None
+
+    def test_dim_clips_of_16_bits_have_those_of_bright_ones(self, clip, titled, shaken, sequence):
+        plain, marked = u8(0.8 * clip.frames), shaken.copy()
+        marked[:, 40:44, 20:60] = 255
+        # A camera of more bits sees what lies between two levels.
+        between = np.random.default_rng(1).uniform(-0.5, 0.5, (COUNT, 112, 112))
+        for name, bright in {"title": titled, "reticle": marked, "plain": plain, "shaken": shaken}.items():
+            dim = u16(0.1 + 0.02 / 255 * (bright + between[:, : bright.shape[1], : bright.shape[2]]))
+            _, _, title, decisions = without_overlay(surveyed(dim))
+            assert (title is not None, len(decisions)) == (name == "title", name in ("title", "reticle")), name
+            if title is not None:
+                assert (title.mask == without_overlay(surveyed(bright))[2].mask).mean() > 0.98
+        # Levels of 8 bits stay coarse in a file of 16.
+        for steps in (2, 6, 8):
+            coarse = 257 * np.rint(steps * sequence.frames.clip(0, 1)).astype(np.uint16)
+            assert without_overlay(surveyed(coarse))[3] == ()
 
     def test_a_quiet_row_of_a_broad_edge_is_no_title(self):
         clear, drawn = np.zeros((2, 60, 60), bool)

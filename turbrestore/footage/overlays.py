@@ -48,8 +48,9 @@ _LEAST_MOTION = 3.0
 # An edge is static if it varies by less than its gradient times this share of the motion of the edges, or one pixel,
 # and if its gradient is that many times the noise; with a static camera, the edges move by at least so many pixels.
 _STATIC, _DEVIATIONS, _LEAST_BENDING = 1 / 3, 8.0, 0.3
-# Deviation of a static pixel, in units of the noise of a frame, and the least in intensity.
-_STILL, _LEAST_STILL = 2.5, 1 / 255
+# Deviation of a static pixel, in units of the noise of a frame, if that is more than a grey level; part of the scale
+# below which the grey level of a clip is less than that of 8 bits, and percentiles between which it is measured.
+_STILL, _SPAN, _RANGE = 2.5, 0.5, (1, 99)
 # Largest deviation of pixels without noise, in units of the noise, and level of a dark stop, from black to the scene.
 _CONSTANT, _DARK = 0.5, 0.25
 # Fewest static edge pixels of an overlay, as a share of the frame, and the largest part of a frame that it may cover.
@@ -70,9 +71,9 @@ _NOISELESS, _DRAWN = 0.7, 1 / 8
 _LEAST_DRAWN, _BORDER = 1 / 3, 3
 # A part of a title has moved if edges with this share of its squared gradients are so many pixels from where they were.
 _MOVED, _MOTION = 0.5, 0.5
-# Strokes of a clock: largest change of a pixel that stays, in units of the noise and in intensity; least share of the
-# frames that have an edge there, and of these in which it stays; fewest connected pixels.
-_SAME, _LEAST_SAME, _OFTEN, _REMAINS, _FEWEST_STROKES = 1.0, 1.5 / 255, 0.2, 0.25, 12
+# Strokes of a clock: largest change of a pixel that stays, in units of the noise and in grey levels; least share of
+# the frames that have an edge there, and of these in which it stays; fewest connected pixels.
+_SAME, _LEAST_SAME, _OFTEN, _REMAINS, _FEWEST_STROKES = 1.0, 1.5, 0.2, 0.25, 12
 # Fewest frames in which it stays, and the share that 10 % of the edges exceed in a scene that moves by a pixel.
 _TIMES, _USUAL, _ALMOST_USUAL = 2, 0.15, 1.5
 # Largest part of the frame that digits take.
@@ -128,13 +129,12 @@ class Title:
         before, gradient, parts = self._pixels
         edges = gradient > _DEVIATIONS * noise
         moved = edges & (np.abs(luminance(frame)[self.mask] - before) > _MOTION * gradient)
-        count = int(parts.max()) + 1
-        of_all, gone = (np.bincount(parts[pixels], gradient[pixels] ** 2, count) for pixels in (edges, moved))
-        still = gone <= _MOVED * of_all
+        of_all, gone = (np.bincount(parts, gradient**2 * pixels) for pixels in (edges, moved))
+        still = (gone <= _MOVED * of_all)[parts]
         if still.all():
             return self
         mask = self.mask.copy()
-        mask[mask] = still[parts]
+        mask[mask] = still
         return replace(self, mask=mask) if mask.any() else None
 
     def put_back(self, image: FloatArray, left: int = 0, top: int = 0) -> FloatArray:
@@ -176,9 +176,10 @@ def without_overlay(
     given, title = mask is not None, None
     if mask is None and FEWEST <= len(survey.small) <= _MOST:
         moments = moments or measure_moments(survey)
-        mask, title = _static_regions(survey.clip, moments)
+        level = _grey_level(survey, moments)
+        mask, title = _static_regions(survey.clip, moments, level)
         if mask is not None:
-            digits = _digits(survey.clip, moments, mask if title is None else title.mask)
+            digits = _digits(survey.clip, moments, level, mask if title is None else title.mask)
             mask, title = _with_digits(mask, title, digits)
     if mask is None:
         return survey, None, None, ()
@@ -193,7 +194,7 @@ def without_overlay(
     if titles_only:
         return survey, None, None, ()
     if moments is not None and not given:
-        mask, _ = _static_regions(survey.clip, moments, shifts)
+        mask, _ = _static_regions(survey.clip, moments, level, shifts)
         if mask is None:
             return survey, None, None, ()
         mask, _ = _with_digits(mask, None, digits & _around(mask, len(mask) // _LINE))
@@ -209,29 +210,28 @@ def without_overlay(
 
 
 def _static_regions(
-    source: FrameSource, moments: Moments, shifts: NDArray[np.float64] | None = None
+    source: FrameSource, moments: Moments, level: float, shifts: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.bool_] | None, Title | None]:
     """Find connected regions with static edges: for a camera that moves and, if edges move, for a static one.
 
     Where ``shifts`` (T, 2) of the camera are known, what lies along its path does not count.
     """
-    mean, noise, deviation = luminance(moments.mean), moments.noise, np.sqrt(moments.variance)
-    floor = max(_STILL * noise, _LEAST_STILL)
-    still = deviation < floor
+    mean, deviation = luminance(moments.mean), np.sqrt(moments.variance)
+    noise = max(moments.noise, level / _STILL)
+    still = deviation < _STILL * noise
     gradient = np.hypot(*sobel_gradient(mean))
-    clear = gradient > _DEVIATIONS / _STILL * floor
-    motion = measured = _motion(deviation[clear], gradient[clear], noise)
+    clear = gradient > _DEVIATIONS * noise
+    motion = measured = _motion(deviation[clear], gradient[clear], moments.noise)
     if shifts is not None:
         slopes = sobel_gradient(mean)
         across = np.einsum("iyx,ij,jyx->yx", slopes, np.cov(shifts.T), slopes)
         motion = np.minimum(measured, np.sqrt(np.maximum(across, 0)) / np.maximum(gradient, 1e-6))
     edges = still & clear & (gradient * np.minimum(_STATIC * motion, 1.0) > deviation)
     # A title has no noise of the camera, unless a coder spreads noise over it.
-    noiseless = _NOISELESS * max(noise, _LEAST_STILL / _STILL)
-    drawn = _titles(clear & (deviation < np.maximum(_DRAWN * motion * gradient, noiseless)), clear)
+    drawn = _titles(clear & (deviation < np.maximum(_DRAWN * motion * gradient, _NOISELESS * noise)), clear)
     if edges.sum() < _LEAST_EDGES * edges.size and not drawn.any():
         return None, None
-    constant = deviation < _CONSTANT * max(noise, _LEAST_STILL / _STILL)
+    constant = deviation < _CONSTANT * noise
     # A flat part of the scene does not change either; an overlay lacks the noise of the scene, or is dark like a stop.
     black = float(mean.min())
     dark = mean < black + _DARK * (float(np.median(mean[~still])) - black) if (~still).any() else still
@@ -243,6 +243,14 @@ def _static_regions(
         return mask, None
     letters = _with_gaps(_regions((constant & _around(drawn, _NEAR)) | drawn, drawn))
     return mask, Title(_around(letters > 0, 1), moments.mean, source.window)
+
+
+def _grey_level(survey: Survey, moments: Moments) -> float:
+    """Intensity of one of 255 levels of what a clip spans, at most that of 8 bits and at least the step of the file."""
+    low, high = np.percentile(luminance(moments.mean), _RANGE)
+    # The numbers of a file may be of fewer bits than its type.
+    step = np.diff(np.unique(survey.pixels[0])).min(initial=survey.clip.full_scale) / survey.clip.full_scale
+    return min(max(float(high - low) / _SPAN / 255, float(step), 1 / (2**survey.clip.bit_depth - 1)), 1 / 255)
 
 
 def _titles(drawn: NDArray[np.bool_], clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -260,11 +268,10 @@ def _titles(drawn: NDArray[np.bool_], clear: NDArray[np.bool_]) -> NDArray[np.bo
     return drawn & _around(many[labels], len(drawn) // _LINE)
 
 
-def _digits(source: FrameSource, moments: Moments, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _digits(source: FrameSource, moments: Moments, level: float, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mark strokes that stay from one frame to the next, and change at times; with the gaps between them."""
-    same, clear = max(_SAME * moments.noise, _LEAST_SAME), _DEVIATIONS * max(moments.noise, _LEAST_STILL / _STILL)
-    # Less than twice as many frames are looked at, so that a byte counts them.
-    edges, static = np.zeros((2, *source.shape[1:3]), np.uint8)
+    same, clear = max(_SAME * moments.noise, _LEAST_SAME * level), _DEVIATIONS * max(moments.noise, level / _STILL)
+    edges, static = np.zeros((2, *source.shape[1:3]), np.int16)
     part, before = source.select((0, len(source), max(1, len(source) // _LOOKED_AT))), None
     for frame in part:
         grey = luminance(frame)
