@@ -249,6 +249,14 @@ class TestTitles:
             coarse = 257 * np.rint(steps * sequence.frames.clip(0, 1)).astype(np.uint16)
             assert without_overlay(surveyed(coarse))[3] == ()
 
+    def test_they_are_large_enough_and_the_scene_bends_enough(self):
+        waves = np.arange(48) + np.zeros((12, 48, 1))
+        turns = np.where(T[:12] % 2, 1, -1)
+        for bending, side, found in ((0.2, 8, False), (0.4, 8, True), (0.8, 3, False), (0.8, 4, True)):
+            frames = 0.5 + 0.3 * np.sin(np.pi / 6 * (waves + bending * turns))
+            frames[:, 20 : 20 + side, 20 : 20 + side] = 1
+            assert (without_overlay(surveyed(u8(frames)))[2] is not None) == found, (bending, side)
+
     def test_a_quiet_row_of_a_broad_edge_is_no_title(self):
         clear, drawn = np.zeros((2, 60, 60), bool)
         clear[4:7, 5:55], clear[40:48, 30:38] = True, True
