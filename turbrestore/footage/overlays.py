@@ -221,7 +221,8 @@ def _static_regions(
     still = deviation < _STILL * noise
     gradient = np.hypot(*sobel_gradient(mean))
     clear = gradient > _DEVIATIONS * noise
-    motion = measured = _motion(deviation[clear], gradient[clear], moments.noise)
+    moved = np.maximum(deviation[clear] ** 2 - moments.noise**2, 0) / gradient[clear] ** 2
+    motion = measured = float(np.sqrt(np.median(moved))) if moved.size else 0.0
     if shifts is not None:
         slopes = sobel_gradient(mean)
         across = np.einsum("iyx,ij,jyx->yx", slopes, np.cov(shifts.T), slopes)
@@ -318,13 +319,6 @@ def _with_digits(
     _, labels, sizes, _ = cv2.connectedComponentsWithStats((~letters).astype(np.uint8), connectivity=4)
     letters |= (sizes[:, cv2.CC_STAT_AREA] <= (2 * _BESIDE + 1) ** 2)[labels]
     return mask | wide, replace(title, mask=letters)
-
-
-def _motion(deviation: NDArray[np.float64], gradient: FloatArray, noise: float) -> float:
-    """Motion of most edges, pixels."""
-    if not deviation.size:
-        return 0.0
-    return float(np.sqrt(np.median(np.maximum(deviation**2 - noise**2, 0) / gradient**2)))
 
 
 def _regions(grown: NDArray[Any], marks: NDArray[np.bool_], fewest: int = 1) -> NDArray[np.bool_]:
