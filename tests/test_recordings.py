@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from conftest import make_sequence, surveyed
+from conftest import SCENES, make_sequence, surveyed
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.footage.bars import without_bars
@@ -125,6 +125,26 @@ class TestOverlays:
         for k, frame in enumerate(covered):
             cv2.putText(frame, f"{k:02d}", (8, 104), cv2.FONT_HERSHEY_SIMPLEX, 0.3, 255, 1)
         assert self.alike(shaken, covered) > 30
+
+    def test_thin_lines_alone(self, shaken):
+        covered = shaken.copy()
+        covered[:, 56, 36:76] = covered[:, 36:76, 56] = 255
+        read = without_overlay(surveyed(covered))[0].clip.read()
+        assert read[:, 56, 36:76].mean() < 0.9 and read[:, 36:76, 56].mean() < 0.9
+
+    def test_what_a_camera_that_hardly_moves_shows_is_kept(self):
+        rng = np.random.default_rng(0)
+        places, noise = rng.standard_normal((12, 2)), 0.008 * rng.standard_normal((12, 64, 64))
+        places -= places.mean(axis=0)
+        places /= np.sqrt(np.mean(np.sum(places**2, axis=1)))
+        scene = 0.8 * SCENES["chart"](104)
+        for motion, what in ((2, "kept"), (4, "replaced")):
+            corners = 20 + np.rint(motion * places).astype(int)
+            frames = noise + np.stack([scene[y : y + 64, x : x + 64] for x, y in corners])
+            frames[:, 48:58, 6:40] = 0
+            frames[:, 50:56, 8:38:3] = 1
+            (found,) = without_overlay(surveyed(u8(frames)))[3]
+            assert what in found.choice
 
     def test_switched_off(self, shaken):
         covered = shaken.copy()
