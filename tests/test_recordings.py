@@ -13,7 +13,7 @@ from turbrestore.footage.bars import without_bars
 from turbrestore.footage.checks.content import check_content
 from turbrestore.footage.levels import stretch_levels
 from turbrestore.footage.lighting.light import steady_light
-from turbrestore.footage.overlays import _titles, read_static_mask, without_overlay
+from turbrestore.footage.overlays import Title, _titles, read_static_mask, without_overlay
 from turbrestore.io.images import write_image
 from turbrestore.io.source import FrameSource
 from turbrestore.metrics import compare
@@ -276,6 +276,15 @@ class TestTitles:
             frames = 0.5 + 0.3 * np.sin(np.pi / 6 * (waves + bending * turns))
             frames[:, 20 : 20 + side, 20 : 20 + side] = 1
             assert (without_overlay(surveyed(u8(frames)))[2] is not None) == found, (bending, side)
+
+    def test_parts_stay_unless_half_of_their_edges_move_by_half_a_pixel(self):
+        ramp, mask = np.tile(np.linspace(0, 1, 41, dtype=np.float32), (30, 1)), np.zeros((30, 41), bool)
+        mask[5:25, 5:35] = True
+        title = Title(mask, ramp, np.s_[:30, :41])
+        for rows, pixels, stays in ((20, 0.35, True), (20, 0.7, False), (7, 2, True), (14, 2, False)):
+            frame = ramp.copy()
+            frame[5 : 5 + rows] += pixels / 40
+            assert title.at_rest(frame, 0.001) is (title if stays else None), (rows, pixels)
 
     def test_a_quiet_row_of_a_broad_edge_is_no_title(self):
         clear, drawn = np.zeros((2, 60, 60), bool)
