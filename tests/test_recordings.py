@@ -234,6 +234,22 @@ class TestTitles:
         np.testing.assert_allclose(title.put_back(np.zeros((20, 30)), 5, 55)[title.mask[55:75, 5:35]].max(), 1)
         assert len(check_content(FrameSource.from_array(titled)).stuck) == 0
 
+    def test_the_mask_is_that_of_the_text(self, titled):
+        rim, letters = np.zeros((2, 96, 96), np.uint8)
+        for canvas, width in ((rim, 3), (letters, 1)):
+            cv2.putText(canvas, "GATE 7", (6, 82), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 255, width)
+        scene = 0.05 + 0.8 * make_sequence(17, COUNT, 96, "camera", blur=0.8, noise=0.008, rms=1.2).frames
+        for frames in (titled, u8(np.where(rim == 255, letters == 255, scene))):
+            text, mask = frames.std(axis=0) == 0, without_overlay(surveyed(frames))[2].mask
+            assert mask[text].mean() > 0.95
+            assert not mask[cv2.dilate(text.astype(np.uint8), np.ones((13, 13))) == 0].any()
+
+    def test_where_little_moves_lines_are_found_and_nothing_else(self):
+        frames = u8(0.05 + 0.8 * make_sequence(17, COUNT, 96, "chart", blur=0.8, noise=0.008, rms=0.4).frames)
+        assert without_overlay(surveyed(frames))[3] == ()
+        frames[:, 48, 28:68] = frames[:, 28:68, 48] = 255
+        assert without_overlay(surveyed(frames))[2].mask[48, 28:68].mean() > 0.9
+
     def test_a_small_mark_that_a_coder_made_noisy_keeps_its_colour(self, clip):
         frames = np.repeat(u8(0.8 * clip.frames)[..., None], 3, axis=3)
         plain = frames.copy()
