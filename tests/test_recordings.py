@@ -126,6 +126,12 @@ class TestOverlays:
             cv2.putText(frame, f"{k:02d}", (8, 104), cv2.FONT_HERSHEY_SIMPLEX, 0.3, 255, 1)
         assert self.alike(shaken, covered) > 30
 
+    def test_a_stop_may_cover_half_of_the_frame_and_not_nearly_all(self, shaken):
+        y, x = np.mgrid[:112, :112]
+        for radius, count in ((45, 1), (25, 0)):
+            stop = np.clip(radius - np.hypot(x - 56, y - 56), 0, 1)
+            assert len(without_overlay(surveyed(np.rint(shaken * stop).astype(np.uint8)))[3]) == count, radius
+
     def test_thin_lines_alone(self, shaken):
         covered = shaken.copy()
         covered[:, 56, 36:76] = covered[:, 36:76, 56] = 255
@@ -234,6 +240,11 @@ class TestTitles:
         np.testing.assert_allclose(title.put_back(np.zeros((20, 30)), 5, 55)[title.mask[55:75, 5:35]].max(), 1)
         assert len(check_content(FrameSource.from_array(titled)).stuck) == 0
 
+    def test_three_frames_are_enough(self, clip, titled):
+        plain = u8(0.8 * clip.frames)
+        found = [len(without_overlay(surveyed(some))[3]) for some in (plain[:2], plain[:3], titled[:3])]
+        assert found == [0, 0, 1]
+
     def test_the_mask_is_that_of_the_text(self, titled):
         rim, letters = np.zeros((2, 96, 96), np.uint8)
         for canvas, width in ((rim, 3), (letters, 1)):
@@ -325,6 +336,17 @@ class TestClocks:
         assert title.mask[:46].sum() == 0
         found = restore(FrameSource.from_array(frames))
         np.testing.assert_allclose(found.image[title.mask], frames.mean(axis=0)[title.mask] / 255, atol=0.01)
+
+    def test_a_camera_that_moves_shows_the_scene_behind_them(self, shaken):
+        frames = shaken.copy()
+        for number, frame in enumerate(frames):
+            for shade, width in ((0, 3), (255, 1)):
+                cv2.putText(frame, f"1:{number // 2:02d}", (8, 98), cv2.FONT_HERSHEY_SIMPLEX, 0.5, shade, width)
+        read = 255 * without_overlay(surveyed(frames))[0].clip.read()
+        text = frames != shaken
+        assert (np.abs(read - frames)[text] > 1).mean() > 0.95
+        far = cv2.dilate(text.any(axis=0).astype(np.uint8), np.ones((13, 13))) == 0
+        assert (np.rint(read[:, far]) != shaken[:, far]).mean() < 0.005
 
 
 class TestBars:
