@@ -49,7 +49,7 @@ _LEAST_MOTION = 3.0
 # and if its gradient is that many times the noise; with a static camera, the edges move by at least so many pixels.
 _STATIC, _DEVIATIONS, _LEAST_BENDING = 1 / 3, 8.0, 0.3
 # Deviation of a static pixel, in units of the noise of a frame, if that is more than a grey level; part of the scale
-# below which the grey level of a clip is less than that of 8 bits, and percentiles between which it is measured.
+# that a clip spans between these percentiles if its grey level is that of 8 bits.
 _STILL, _SPAN, _RANGE = 2.5, 0.5, (1, 99)
 # Largest deviation of pixels without noise, in units of the noise, and level of a dark stop, from black to the scene.
 _CONSTANT, _DARK = 0.5, 0.25
@@ -171,7 +171,7 @@ def without_overlay(
 
     Return the frames, the pixels (H, W) of the scene that no frame shows, the title that has to be put back into
     results because the camera is static as well, and the decisions. ``mask`` (H, W) names the pixels that are replaced;
-    ``moments`` are those of the survey, if they are known.  With ``titles_only``, what a moving camera shows stays.
+    ``moments`` are those of the survey, if they are known.  With ``titles_only`` a moving camera keeps its overlay.
     """
     given, title = mask is not None, None
     if mask is None and FEWEST <= len(survey.small) <= _MOST:
@@ -247,7 +247,7 @@ def _static_regions(
 
 
 def _grey_level(survey: Survey, moments: Moments) -> float:
-    """Intensity of one of 255 levels of what a clip spans, at most that of 8 bits and at least the step of the file."""
+    """Least change that counts: a level of 8 bits or, where a file has finer steps and a clip spans little, less."""
     low, high = np.percentile(luminance(moments.mean), _RANGE)
     # The numbers of a file may be of fewer bits than its type.
     step = np.diff(np.unique(survey.pixels[0])).min(initial=survey.clip.full_scale) / survey.clip.full_scale
