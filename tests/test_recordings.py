@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from conftest import make_sequence, surveyed
+from conftest import SCENES, make_sequence, surveyed
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.footage.bars import without_bars
 from turbrestore.footage.checks.content import check_content
 from turbrestore.footage.levels import stretch_levels
 from turbrestore.footage.lighting.light import steady_light
-from turbrestore.footage.overlays import _titles, read_static_mask, without_overlay
+from turbrestore.footage.overlays import Title, _titles, read_static_mask, without_overlay
 from turbrestore.io.images import write_image
 from turbrestore.io.source import FrameSource
 from turbrestore.metrics import compare
@@ -126,6 +126,32 @@ class TestOverlays:
             cv2.putText(frame, f"{k:02d}", (8, 104), cv2.FONT_HERSHEY_SIMPLEX, 0.3, 255, 1)
         assert self.alike(shaken, covered) > 30
 
+    def test_a_stop_may_cover_half_of_the_frame_and_not_nearly_all(self, shaken):
+        y, x = np.mgrid[:112, :112]
+        for radius, count in ((45, 1), (25, 0)):
+            stop = np.clip(radius - np.hypot(x - 56, y - 56), 0, 1)
+            assert len(without_overlay(surveyed(np.rint(shaken * stop).astype(np.uint8)))[3]) == count, radius
+
+    def test_thin_lines_alone(self, shaken):
+        covered = shaken.copy()
+        covered[:, 56, 36:76] = covered[:, 36:76, 56] = 255
+        read = without_overlay(surveyed(covered))[0].clip.read()
+        assert read[:, 56, 36:76].mean() < 0.9 and read[:, 36:76, 56].mean() < 0.9
+
+    def test_what_a_camera_that_hardly_moves_shows_is_kept(self):
+        rng = np.random.default_rng(0)
+        places, noise = rng.standard_normal((12, 2)), 0.008 * rng.standard_normal((12, 64, 64))
+        places -= places.mean(axis=0)
+        places /= np.sqrt(np.mean(np.sum(places**2, axis=1)))
+        scene = 0.8 * SCENES["chart"](104)
+        for motion, what in ((2, "kept"), (4, "replaced")):
+            corners = 20 + np.rint(motion * places).astype(int)
+            frames = noise + np.stack([scene[y : y + 64, x : x + 64] for x, y in corners])
+            frames[:, 48:58, 6:40] = 0
+            frames[:, 50:56, 8:38:3] = 1
+            (found,) = without_overlay(surveyed(u8(frames)))[3]
+            assert what in found.choice
+
     def test_switched_off(self, shaken):
         covered = shaken.copy()
         covered[:, 40, 20:60] = 255
@@ -178,9 +204,11 @@ class TestOverlays:
 
     def test_a_window_is_that_of_the_whole_frame(self, shaken):
         covered = shaken.copy()
-        covered[:, 40, 20:60] = 255
-        source, _, _, _ = without_overlay(surveyed(covered))
-        source = source.clip
+        covered[:, 40:44, 20:60] = 255
+        survey = surveyed(covered)
+        assert without_overlay(survey, titles_only=True) == (survey, None, None, ())
+        source = without_overlay(survey)[0].clip
+        assert (source.read()[:, 41:43, 22:58] < 1).any()
         part = source.select((2, 5), (15, 30, 30, 25))
         np.testing.assert_array_equal(part.read(), source.read(2, 5)[:, 30:55, 15:45])
 
@@ -212,6 +240,27 @@ class TestTitles:
         np.testing.assert_allclose(title.put_back(np.zeros((20, 30)), 5, 55)[title.mask[55:75, 5:35]].max(), 1)
         assert len(check_content(FrameSource.from_array(titled)).stuck) == 0
 
+    def test_three_frames_are_enough(self, clip, titled):
+        plain = u8(0.8 * clip.frames)
+        found = [len(without_overlay(surveyed(some))[3]) for some in (plain[:2], plain[:3], titled[:3])]
+        assert found == [0, 0, 1]
+
+    def test_the_mask_is_that_of_the_text(self, titled):
+        rim, letters = np.zeros((2, 96, 96), np.uint8)
+        for canvas, width in ((rim, 3), (letters, 1)):
+            cv2.putText(canvas, "GATE 7", (6, 82), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 255, width)
+        scene = 0.05 + 0.8 * make_sequence(17, COUNT, 96, "camera", blur=0.8, noise=0.008, rms=1.2).frames
+        for frames in (titled, u8(np.where(rim == 255, letters == 255, scene))):
+            text, mask = frames.std(axis=0) == 0, without_overlay(surveyed(frames))[2].mask
+            assert mask[text].mean() > 0.95
+            assert not mask[cv2.dilate(text.astype(np.uint8), np.ones((13, 13))) == 0].any()
+
+    def test_where_little_moves_lines_are_found_and_nothing_else(self):
+        frames = u8(0.05 + 0.8 * make_sequence(17, COUNT, 96, "chart", blur=0.8, noise=0.008, rms=0.4).frames)
+        assert without_overlay(surveyed(frames))[3] == ()
+        frames[:, 48, 28:68] = frames[:, 28:68, 48] = 255
+        assert without_overlay(surveyed(frames))[2].mask[48, 28:68].mean() > 0.9
+
     def test_a_small_mark_that_a_coder_made_noisy_keeps_its_colour(self, clip):
         frames = np.repeat(u8(0.8 * clip.frames)[..., None], 3, axis=3)
         plain = frames.copy()
@@ -230,6 +279,39 @@ class TestTitles:
         noise = np.random.default_rng(1).normal(0, 2, titled.shape)
         still = np.where(titled[0] == 255, 255, np.clip(titled[0] + noise, 0, 250)).astype(np.uint8)
         assert without_overlay(surveyed(still))[2] is None
+
+    def test_dim_clips_of_16_bits_have_those_of_bright_ones(self, clip, titled, shaken, sequence):
+        plain, marked = u8(0.8 * clip.frames), shaken.copy()
+        marked[:, 40:44, 20:60] = 255
+        # A camera of more bits sees what lies between two levels.
+        between = np.random.default_rng(1).uniform(-0.5, 0.5, (COUNT, 112, 112))
+        for name, bright in {"title": titled, "reticle": marked, "plain": plain, "shaken": shaken}.items():
+            dim = u16(0.1 + 0.02 / 255 * (bright + between[:, : bright.shape[1], : bright.shape[2]]))
+            _, _, title, decisions = without_overlay(surveyed(dim))
+            assert (title is not None, len(decisions)) == (name == "title", name in ("title", "reticle")), name
+            if title is not None:
+                assert (title.mask == without_overlay(surveyed(bright))[2].mask).mean() > 0.98
+        # Levels of 8 bits stay coarse in a file of 16.
+        for steps in (2, 6, 8):
+            coarse = 257 * np.rint(steps * sequence.frames.clip(0, 1)).astype(np.uint16)
+            assert without_overlay(surveyed(coarse))[3] == ()
+
+    def test_they_are_large_enough_and_the_scene_bends_enough(self):
+        waves = np.arange(48) + np.zeros((12, 48, 1))
+        turns = np.where(T[:12] % 2, 1, -1)
+        for bending, side, found in ((0.2, 8, False), (0.4, 8, True), (0.8, 3, False), (0.8, 4, True)):
+            frames = 0.5 + 0.3 * np.sin(np.pi / 6 * (waves + bending * turns))
+            frames[:, 20 : 20 + side, 20 : 20 + side] = 1
+            assert (without_overlay(surveyed(u8(frames)))[2] is not None) == found, (bending, side)
+
+    def test_parts_stay_unless_half_of_their_edges_move_by_half_a_pixel(self):
+        ramp, mask = np.tile(np.linspace(0, 1, 41, dtype=np.float32), (30, 1)), np.zeros((30, 41), bool)
+        mask[5:25, 5:35] = True
+        title = Title(mask, ramp, np.s_[:30, :41])
+        for rows, pixels, stays in ((20, 0.35, True), (20, 0.7, False), (7, 2, True), (14, 2, False)):
+            frame = ramp.copy()
+            frame[5 : 5 + rows] += pixels / 40
+            assert title.at_rest(frame, 0.001) is (title if stays else None), (rows, pixels)
 
     def test_a_quiet_row_of_a_broad_edge_is_no_title(self):
         clear, drawn = np.zeros((2, 60, 60), bool)
@@ -254,6 +336,17 @@ class TestClocks:
         assert title.mask[:46].sum() == 0
         found = restore(FrameSource.from_array(frames))
         np.testing.assert_allclose(found.image[title.mask], frames.mean(axis=0)[title.mask] / 255, atol=0.01)
+
+    def test_a_camera_that_moves_shows_the_scene_behind_them(self, shaken):
+        frames = shaken.copy()
+        for number, frame in enumerate(frames):
+            for shade, width in ((0, 3), (255, 1)):
+                cv2.putText(frame, f"1:{number // 2:02d}", (8, 98), cv2.FONT_HERSHEY_SIMPLEX, 0.5, shade, width)
+        read = 255 * without_overlay(surveyed(frames))[0].clip.read()
+        text = frames != shaken
+        assert (np.abs(read - frames)[text] > 1).mean() > 0.95
+        far = cv2.dilate(text.any(axis=0).astype(np.uint8), np.ones((13, 13))) == 0
+        assert (np.rint(read[:, far]) != shaken[:, far]).mean() < 0.005
 
 
 class TestBars:

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -47,8 +48,9 @@ _LEAST_MOTION = 3.0
 # An edge is static if it varies by less than its gradient times this share of the motion of the edges, or one pixel,
 # and if its gradient is that many times the noise; with a static camera, the edges move by at least so many pixels.
 _STATIC, _DEVIATIONS, _LEAST_BENDING = 1 / 3, 8.0, 0.3
-# Deviation of a static pixel, in units of the noise of a frame, and the least in intensity.
-_STILL, _LEAST_STILL = 2.5, 1 / 255
+# Deviation of a static pixel, in units of the noise of a frame, if that is more than a grey level; part of the scale
+# that a clip spans between these percentiles if its grey level is that of 8 bits.
+_STILL, _SPAN, _RANGE = 2.5, 0.5, (1, 99)
 # Largest deviation of pixels without noise, in units of the noise, and level of a dark stop, from black to the scene.
 _CONSTANT, _DARK = 0.5, 0.25
 # Fewest static edge pixels of an overlay, as a share of the frame, and the largest part of a frame that it may cover.
@@ -69,9 +71,9 @@ _NOISELESS, _DRAWN = 0.7, 1 / 8
 _LEAST_DRAWN, _BORDER = 1 / 3, 3
 # A part of a title has moved if edges with this share of its squared gradients are so many pixels from where they were.
 _MOVED, _MOTION = 0.5, 0.5
-# Strokes of a clock: largest change of a pixel that stays, in units of the noise and in intensity; least share of the
-# frames that have an edge there, and of these in which it stays; fewest connected pixels.
-_SAME, _LEAST_SAME, _OFTEN, _REMAINS, _FEWEST_STROKES = 1.0, 1.5 / 255, 0.2, 0.25, 12
+# Strokes of a clock: largest change of a pixel that stays, in units of the noise and in grey levels; least share of
+# the frames that have an edge there, and of these in which it stays; fewest connected pixels.
+_SAME, _LEAST_SAME, _OFTEN, _REMAINS, _FEWEST_STROKES = 1.0, 1.5, 0.2, 0.25, 12
 # Fewest frames in which it stays, and the share that 10 % of the edges exceed in a scene that moves by a pixel.
 _TIMES, _USUAL, _ALMOST_USUAL = 2, 0.15, 1.5
 # Largest part of the frame that digits take.
@@ -115,15 +117,24 @@ class Title:
         mask = self.mask[relative_window(self.window, window)]
         return continued(values, ~mask) if mask.any() else values
 
+    @cached_property
+    def _pixels(self) -> tuple[FloatArray, FloatArray, NDArray[np.int32]]:
+        """Luminance, gradient and number of the part, from 1, of every pixel of the title."""
+        grey = luminance(self.frame)
+        labels = cv2.connectedComponents(self.mask.astype(np.uint8), connectivity=8)[1]
+        return grey[self.mask], np.hypot(*sobel_gradient(grey))[self.mask], labels[self.mask]
+
     def at_rest(self, frame: FloatArray, noise: float) -> Title | None:
         """Keep the parts whose edges have not moved: blocks that a coder copies look drawn for a while."""
-        before = luminance(self.frame)
-        gradient = np.hypot(*sobel_gradient(before))
-        edges = self.mask & (gradient > _DEVIATIONS * noise)
-        moved = edges & (np.abs(luminance(frame) - before) > _MOTION * gradient)
-        count, labels = cv2.connectedComponents(self.mask.astype(np.uint8), connectivity=8)
-        of_all, gone = (np.bincount(labels[pixels], gradient[pixels] ** 2, count) for pixels in (edges, moved))
-        mask = self.mask & (gone <= _MOVED * of_all)[labels]
+        before, gradient, parts = self._pixels
+        edges = gradient > _DEVIATIONS * noise
+        moved = edges & (np.abs(luminance(frame)[self.mask] - before) > _MOTION * gradient)
+        of_all, gone = (np.bincount(parts, gradient**2 * pixels) for pixels in (edges, moved))
+        still = (gone <= _MOVED * of_all)[parts]
+        if still.all():
+            return self
+        mask = self.mask.copy()
+        mask[mask] = still
         return replace(self, mask=mask) if mask.any() else None
 
     def put_back(self, image: FloatArray, left: int = 0, top: int = 0) -> FloatArray:
@@ -154,20 +165,21 @@ def read_static_mask(path: str | os.PathLike[str], source: FrameSource) -> NDArr
 
 
 def without_overlay(
-    survey: Survey, mask: NDArray[np.bool_] | None = None, moments: Moments | None = None
+    survey: Survey, mask: NDArray[np.bool_] | None = None, moments: Moments | None = None, titles_only: bool = False
 ) -> tuple[Survey, NDArray[np.bool_] | None, Title | None, tuple[Decision, ...]]:
     """Replace the static overlay of a clip; frames without one are returned as they are.
 
     Return the frames, the pixels (H, W) of the scene that no frame shows, the title that has to be put back into
     results because the camera is static as well, and the decisions. ``mask`` (H, W) names the pixels that are replaced;
-    ``moments`` are those of the survey, if they are known.
+    ``moments`` are those of the survey, if they are known.  With ``titles_only`` a moving camera keeps its overlay.
     """
     given, title = mask is not None, None
     if mask is None and FEWEST <= len(survey.small) <= _MOST:
         moments = moments or measure_moments(survey)
-        mask, title = _static_regions(survey.clip, moments)
+        level = _grey_level(survey, moments)
+        mask, title = _static_regions(survey.clip, moments, level)
         if mask is not None:
-            digits = _digits(survey.clip, moments, mask if title is None else title.mask)
+            digits = _digits(survey.clip, moments, level, mask if title is None else title.mask)
             mask, title = _with_digits(mask, title, digits)
     if mask is None:
         return survey, None, None, ()
@@ -179,8 +191,10 @@ def without_overlay(
         choice = f"{100 * float(title.mask.mean()):.1f} % of the frame kept as in the mean of the frames"
         reason = "it is static while the air bends the scene around it; it is neither moved nor deblurred"
         return survey.adjusted(title.without, small), title.mask, title, (Decision("overlay", choice, reason),)
+    if titles_only:
+        return survey, None, None, ()
     if moments is not None and not given:
-        mask, _ = _static_regions(survey.clip, moments, shifts)
+        mask, _ = _static_regions(survey.clip, moments, level, shifts)
         if mask is None:
             return survey, None, None, ()
         mask, _ = _with_digits(mask, None, digits & _around(mask, len(mask) // _LINE))
@@ -196,29 +210,29 @@ def without_overlay(
 
 
 def _static_regions(
-    source: FrameSource, moments: Moments, shifts: NDArray[np.float64] | None = None
+    source: FrameSource, moments: Moments, level: float, shifts: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.bool_] | None, Title | None]:
     """Find connected regions with static edges: for a camera that moves and, if edges move, for a static one.
 
     Where ``shifts`` (T, 2) of the camera are known, what lies along its path does not count.
     """
-    mean, noise, deviation = luminance(moments.mean), moments.noise, np.sqrt(moments.variance)
-    floor = max(_STILL * noise, _LEAST_STILL)
-    still = deviation < floor
-    slopes = sobel_gradient(mean)
-    gradient = np.hypot(*slopes)
-    clear = gradient > _DEVIATIONS / _STILL * floor
-    motion = measured = _motion(deviation[clear], gradient[clear], noise)
+    mean, deviation = luminance(moments.mean), np.sqrt(moments.variance)
+    noise = max(moments.noise, level / _STILL)
+    still = deviation < _STILL * noise
+    gradient = np.hypot(*sobel_gradient(mean))
+    clear = gradient > _DEVIATIONS * noise
+    moved = np.maximum(deviation[clear] ** 2 - moments.noise**2, 0) / gradient[clear] ** 2
+    motion = measured = float(np.sqrt(np.median(moved))) if moved.size else 0.0
     if shifts is not None:
+        slopes = sobel_gradient(mean)
         across = np.einsum("iyx,ij,jyx->yx", slopes, np.cov(shifts.T), slopes)
         motion = np.minimum(measured, np.sqrt(np.maximum(across, 0)) / np.maximum(gradient, 1e-6))
     edges = still & clear & (gradient * np.minimum(_STATIC * motion, 1.0) > deviation)
     # A title has no noise of the camera, unless a coder spreads noise over it.
-    noiseless = _NOISELESS * max(noise, _LEAST_STILL / _STILL)
-    drawn = _titles(clear & (deviation < np.maximum(_DRAWN * motion * gradient, noiseless)), clear)
+    drawn = _titles(clear & (deviation < np.maximum(_DRAWN * motion * gradient, _NOISELESS * noise)), clear)
     if edges.sum() < _LEAST_EDGES * edges.size and not drawn.any():
         return None, None
-    constant = deviation < _CONSTANT * max(noise, _LEAST_STILL / _STILL)
+    constant = deviation < _CONSTANT * noise
     # A flat part of the scene does not change either; an overlay lacks the noise of the scene, or is dark like a stop.
     black = float(mean.min())
     dark = mean < black + _DARK * (float(np.median(mean[~still])) - black) if (~still).any() else still
@@ -232,25 +246,33 @@ def _static_regions(
     return mask, Title(_around(letters > 0, 1), moments.mean, source.window)
 
 
+def _grey_level(survey: Survey, moments: Moments) -> float:
+    """Least change that counts: a level of 8 bits or, where a file has finer steps and a clip spans little, less."""
+    low, high = np.percentile(luminance(moments.mean), _RANGE)
+    # The numbers of a file may be of fewer bits than its type.
+    step = np.diff(np.unique(survey.pixels[0])).min(initial=survey.clip.full_scale) / survey.clip.full_scale
+    return min(max(float(high - low) / _SPAN / 255, float(step), 1 / (2**survey.clip.bit_depth - 1)), 1 / 255)
+
+
 def _titles(drawn: NDArray[np.bool_], clear: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Keep drawn pixels in and near regions of many: in few frames of slow air some edges of the scene seem drawn.
 
     A dark line along the border, a pixel or two wide, is no title.
     """
     count, labels = cv2.connectedComponents(_with_gaps(drawn), connectivity=8)
-    beside = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8)).astype(int)
+    beside = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8))
     inner = np.zeros_like(drawn)
     inner[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
-    found, all_edges = (np.bincount(beside[pixels & inner], minlength=count) for pixels in (drawn, clear))
+    found, all_edges = (np.bincount(beside[pixels & inner].astype(int), minlength=count) for pixels in (drawn, clear))
     many = (found >= _FEWEST_STROKES) & (found >= _LEAST_DRAWN * all_edges)
     many[0] = False
     return drawn & _around(many[labels], len(drawn) // _LINE)
 
 
-def _digits(source: FrameSource, moments: Moments, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _digits(source: FrameSource, moments: Moments, level: float, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mark strokes that stay from one frame to the next, and change at times; with the gaps between them."""
-    same, clear = max(_SAME * moments.noise, _LEAST_SAME), _DEVIATIONS * max(moments.noise, _LEAST_STILL / _STILL)
-    edges, static = np.zeros((2, *source.shape[1:3]), np.int32)
+    same, clear = max(_SAME * moments.noise, _LEAST_SAME * level), _DEVIATIONS * max(moments.noise, level / _STILL)
+    edges, static = np.zeros((2, *source.shape[1:3]), np.int16)
     part, before = source.select((0, len(source), max(1, len(source) // _LOOKED_AT))), None
     for frame in part:
         grey = luminance(frame)
@@ -263,7 +285,7 @@ def _digits(source: FrameSource, moments: Moments, mask: NDArray[np.bool_]) -> N
     moving = (edges >= _OFTEN * (len(part) - 1)) & (moments.variance > (_STILL * same) ** 2)
     if not moving.any():
         return moving
-    share = np.where(moving, static / np.maximum(edges, 1), 0)
+    share = np.where(moving, np.divide(static, np.maximum(edges, 1), dtype=np.float64), 0)
     # Where the scene hardly moves, its edges stay at times as well.
     usual = max(float(np.quantile(share[moving], 0.9)) / _USUAL, 1.0)
     share[static < _TIMES] = 0
@@ -297,13 +319,6 @@ def _with_digits(
     _, labels, sizes, _ = cv2.connectedComponentsWithStats((~letters).astype(np.uint8), connectivity=4)
     letters |= (sizes[:, cv2.CC_STAT_AREA] <= (2 * _BESIDE + 1) ** 2)[labels]
     return mask | wide, replace(title, mask=letters)
-
-
-def _motion(deviation: NDArray[np.float64], gradient: FloatArray, noise: float) -> float:
-    """Motion of most edges, pixels."""
-    if not deviation.size:
-        return 0.0
-    return float(np.sqrt(np.median(np.maximum(deviation**2 - noise**2, 0) / gradient**2)))
 
 
 def _regions(grown: NDArray[Any], marks: NDArray[np.bool_], fewest: int = 1) -> NDArray[np.bool_]:

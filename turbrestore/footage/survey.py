@@ -78,22 +78,26 @@ class Moments:
 def measure_moments(survey: Survey) -> Moments:
     """Take the moments of the whole frames of a survey."""
     shape = survey.clip.shape[1:]
-    total, sums, noise = np.zeros(shape), np.zeros((3, *shape[:2])), []
+    sums, noise = np.zeros((3, *shape[:2])), list[float]()
+    total = sums[0] if len(shape) == 2 else np.zeros(shape)
     before: FloatArray | None = None
     for frame in survey:
         grey = luminance(frame)
         if before is not None:
             cv2.accumulateSquare(grey - before, sums[2])
         before = grey
-        cv2.accumulate(frame, total)
         cv2.accumulate(grey, sums[0])
         cv2.accumulateSquare(grey, sums[1])
+        if len(shape) == 3:
+            cv2.accumulate(frame, total)
         noise.append(estimate_noise(grey))
     count = len(survey.numbers)
-    change = (sums[2] / (2 * max(count - 1, 1))).astype(np.float32)
-    sums /= count
-    variance = np.maximum(sums[1] - np.square(sums[0]), 0).astype(np.float32)
-    return Moments((total / count).astype(np.float32), variance, change, float(np.median(noise)), count)
+    # Without temporary arrays: the search for overlays takes most memory here.
+    mean = np.divide(total, count, out=np.empty(shape, np.float32), casting="same_kind")
+    sums /= np.reshape([count, count, 2 * max(count - 1, 1)], (3, 1, 1))
+    sums[1] -= np.square(sums[0], out=sums[0])
+    variance, change = np.maximum(sums[1:], 0, out=sums[1:]).astype(np.float32)
+    return Moments(mean, variance, change, float(np.median(noise)), count)
 
 
 def survey_memory(shape: tuple[int, ...], in_scratch: bool) -> float:

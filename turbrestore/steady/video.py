@@ -202,10 +202,13 @@ class _Scenes:
 
     def keep_title(self, window: Window) -> None:
         """Keep the title that a static camera has drawn over the frames of a window, as long as it is there."""
-        frames = {0: window.frame, **window.neighbours}
-        # A stream is not held to the range that a clip is.
-        stack = np.stack([np.clip(luminance(frames[offset].image), 0, 1) for offset in sorted(frames)])
-        self._title = without_overlay(take_survey(FrameSource.from_array(stack)))[2]
+        images = [frame.image for _, frame in sorted({0: window.frame, **window.neighbours}.items())]
+        shape = (len(images), *images[0].shape[:2])
+        # Nothing says how many bits a stream has, nor is it held to the range that a clip is.
+        clip = FrameSource(
+            "stream", "array", shape, 1, 8, lambda chosen: (np.clip(luminance(images[k]), 0, 1) for k in chosen)
+        )
+        self._title = without_overlay(take_survey(clip), titles_only=True)[2]
 
     def estimate(self, frame: DewarpedFrame) -> tuple[Memory, NDArray[np.bool_], float, Title | None]:
         """Estimate of the scene at a frame, what moves, the width of the blur of what is remembered, and the title."""
