@@ -7,7 +7,8 @@ into the scene, and fusion would darken the result.
 
 from __future__ import annotations
 
-import cv2
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,15 +16,15 @@ from ...io.pixels import PixelArray
 
 # Largest level of black in 8 bits, after a codec, and pixels beside it that a codec or an interpolation has darkened.
 _BLACK_OF_CODEC, _DARKENED = 4, 3
-# Narrowest border, pixels, the share of the frames that have it, and of those that do not, and the least number.
+# Narrowest border, pixels; least share and number of the frames that have it, and of those that do not.
 _NARROWEST, _AT_TIMES, _FEWEST = 3, 0.02, 2
 # Least share of a side that is black in such a frame, and that is black at times, and least number of such sides.
 _OF_SIDE, _SIDES = 0.5, 3
-# Largest distance of the edge of a border from a line, pixels, most of its length that lies beyond, as where the scene
-# is black, and before the line, as the middle of an arc; least share of the borders whose edge is a line.
-_OFF_LINE, _MOST_BEYOND, _MOST_BEFORE, _MOST_STRAIGHT = 2.0, 0.35, 0.05, 0.5
-# Most of a frame that may be black: one without a picture has no border.
-_MOST = 0.5
+# The edge is a line through a place in either outer third of a border, where this share of it is narrower.  It is bent,
+# as an arc, if more than a share of it is so many pixels before the line, and noise, if more than another is beyond.
+_NARROW, _OFF_LINE, _BEFORE, _BEYOND = 0.1, 2.0, 0.05, 0.4
+# Least share of the borders whose edge is straight.
+_STRAIGHT = 0.5
 
 
 class BlackBorderDetector:
@@ -38,56 +39,63 @@ class BlackBorderDetector:
     def update(self, pixels: PixelArray) -> None:
         """Look at the next frame, shape (H, W) or (H, W, 3)."""
         self._frames += 1
-        black, turned = _black(pixels), pixels.swapaxes(0, 1)
-        sides = pixels, pixels[::-1], turned, turned[::-1]
+        black, sides = _black(pixels), _sides(pixels)
         self._black = self._black or [np.zeros((2, side.shape[1]), np.int64) for side in sides]
         for number, side in enumerate(sides):
             strip = _level(side[:_NARROWEST])
             dark = strip.max(axis=0) <= black
             if dark.mean() >= _OF_SIDE:
-                straight = _is_straight(_level(side[: len(side) // 2]) > black)
-                if straight is None:
+                shown = _level(side[: len(side) // 2]) > black
+                if not shown.any():
                     continue
                 self._borders[number] += 1
-                self._straight[number] += straight
+                self._straight[number] += _edge(shown) is not None
             self._black[number] += dark, strip[0] > black
 
     def found(self) -> bool:
         """Tell whether the frames have black borders that change."""
         fewest = max(_AT_TIMES * self._frames, _FEWEST)
         changing = np.array([np.mean((counts >= fewest).all(axis=0)) >= _OF_SIDE for counts in self._black])
-        bordered = (self._borders >= fewest) & (self._straight >= _MOST_STRAIGHT * self._borders)
+        bordered = (self._borders >= fewest) & (self._straight >= _STRAIGHT * self._borders)
         return int(np.sum(changing & bordered)) >= _SIDES
 
 
 def black_border(pixels: PixelArray) -> NDArray[np.bool_]:
-    """Mark, (H, W), what is black and connected to the border of a frame, with the pixels beside it."""
-    dark = (_level(pixels) <= _black(pixels)).astype(np.uint8)
-    around = cv2.copyMakeBorder(dark, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
-    cv2.floodFill(around, None, (0, 0), 2)
-    border = (around[1:-1, 1:-1] == 2).astype(np.uint8)
-    if border.mean() > _MOST:
-        return np.zeros(border.shape, bool)
-    return cv2.dilate(border, np.ones((2 * _DARKENED + 1,) * 2, np.uint8)) > 0
+    """Mark, (H, W), the black borders of a frame, with the pixels beside them."""
+    marked, black = np.zeros(pixels.shape[:2], bool), _black(pixels)
+    for side, place in zip(_sides(pixels), _sides(marked), strict=True):
+        dark = _level(side[:1])[0] <= black
+        edge = _edge(_level(side[: len(side) // 2]) > black) if dark.any() else None
+        if edge is not None:
+            near = np.convolve(dark, np.ones(2 * _DARKENED + 1), "same") > 0
+            place[near & (np.arange(len(place))[:, None] < edge + _DARKENED)] = True
+    return marked
 
 
-def _is_straight(shown: NDArray[np.bool_]) -> bool | None:
-    """Tell whether the edge of what is shown, beyond a black border in the first rows, is a line; None without one."""
+def _edge(shown: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+    """Find the straight edge, (W,), of what is shown beyond a black border in the first rows; None where it is bent.
+
+    Where the scene is black, too, the border seems wider, never narrower.
+    """
     places = np.flatnonzero(shown.any(axis=0) & ~shown[0])
     if not len(places):
         return None
     widths = shown.argmax(axis=0)[places]
     third = -(-len(places) // 3)
-    left, right = (_narrow(places[part], widths[part]) for part in (slice(third), slice(-third, None)))
-    line = left[1] + (places - left[0]) * (right[1] - left[1]) / max(right[0] - left[0], 1)
-    beyond, before = np.mean(widths - line > _OFF_LINE), np.mean(line - widths > _OFF_LINE)
-    return bool(beyond <= _MOST_BEYOND and before <= _MOST_BEFORE)
+    left, right = (
+        start + int(np.argsort(widths[start : start + third], kind="stable")[int(_NARROW * third)])
+        for start in (0, len(places) - third)
+    )
+    slope = (widths[right] - widths[left]) / max(places[right] - places[left], 1)
+    edge = np.asarray(widths[left] + slope * (np.arange(shown.shape[1]) - places[left]), np.float64)
+    off = widths - edge[places]
+    return edge if np.mean(off < -_OFF_LINE) <= _BEFORE and np.mean(off > _OFF_LINE) <= _BEYOND else None
 
 
-def _narrow(places: NDArray[np.int64], widths: NDArray[np.int64]) -> tuple[int, int]:
-    """Place and width where the border is narrower than nearly everywhere: dark parts of the scene widen it."""
-    chosen = np.argsort(widths, kind="stable")[len(widths) // 4]
-    return int(places[chosen]), int(widths[chosen])
+def _sides(pixels: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    """Return views of a frame whose first rows are its top, its bottom, its left and its right."""
+    turned = pixels.swapaxes(0, 1)
+    return pixels, pixels[::-1], turned, turned[::-1]
 
 
 def _level(pixels: PixelArray) -> PixelArray:

@@ -22,6 +22,7 @@ import dataclasses
 from array import array
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,7 +32,7 @@ from ...core.errors import ConfigurationError, DataError, require_between
 from ...core.remarks import Doubt, counted
 from ...io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
 from ...io.source import FrameSource, numbers_text
-from .black_borders import BlackBorderDetector
+from .black_borders import BlackBorderDetector, black_border
 from .missing_pixels import FEW_MISSING, MOST_MISSING, Backdrop, fill_holes, mean_backdrop
 from .repeats import RepeatDetector
 from .scene_cuts import Scene, SceneDetector, group_scenes, thumbnail
@@ -236,6 +237,7 @@ class _ContentScan:
         self._repeats = RepeatDetector()
         self._needs_backdrop = False
         self._borders = BlackBorderDetector()
+        self._thumb: FloatArray | None = None
         self._stuck = StuckPixelDetector(params.stuck_excess)
         self._scenes = SceneDetector(params.cut_similarity)
 
@@ -248,12 +250,16 @@ class _ContentScan:
         self._previous = pixels
         self._repeats.update(values)
         thumb = thumbnail(values)
+        if mosaic is None:
+            self._borders.update(pixels)
+            border = black_border(pixels)
+            if border.any():
+                thumb = _without_border(thumb, border, np.zeros_like(thumb) if self._thumb is None else self._thumb)
+            self._thumb = thumb
         contrast = float(thumb.std())
         self._contrasts.append(contrast)
         # A running estimate of the median, because blank frames must reach neither the scenes nor the stuck pixels.
         self._usual += 0.1 * (max(contrast, _LEAST_CONTRAST) - self._usual) if self._usual else contrast
-        if mosaic is None:
-            self._borders.update(pixels)
         if contrast > max(_LEAST_CONTRAST, self._params.blank_contrast * self._usual):
             # Stuck pixels are isolated in the mosaic; interpolation of colours spreads them.
             self._stuck.update(values if mosaic is None else self._planes(mosaic))
@@ -323,6 +329,15 @@ class _ContentScan:
             self._needs_backdrop = True
             filled = np.where(np.isfinite(filled), filled, np.nanmean(filled)).astype(np.float32)
         return filled
+
+
+def _without_border(thumb: FloatArray, border: NDArray[np.bool_], before: FloatArray) -> FloatArray:
+    """Put the thumbnail before into what a black border covers, because a border that changes is no cut."""
+    covered = cv2.resize(border.astype(np.float32), thumb.shape[::-1], interpolation=cv2.INTER_AREA) > 0
+    if covered.all():
+        return thumb
+    filled = np.where(covered, before - before[~covered].mean(), thumb - thumb[~covered].mean())
+    return np.asarray(filled - filled.mean(), np.float32)
 
 
 def _in_words(report: ContentReport, repeated: bool) -> list[str]:

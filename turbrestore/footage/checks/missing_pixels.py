@@ -45,7 +45,8 @@ def fill_holes(pixels: PixelArray) -> PixelArray:
 class Backdrop:
     """What frames show behind the pixels that others lack."""
 
-    # (H, W) or (H, W, 3): mean over the frames that have a value; where none has one, that of the pixels around.
+    # (H, W) or (H, W, 3): mean over the frames that have a value; where none has one, that of the pixels around.  NaN
+    # where every frame is black: that may be the scene.
     values: FloatArray
     unseen: NDArray[np.bool_]  # (H, W): pixels that no frame has
     black_borders: bool  # whether frames lack what is black along their borders, too
@@ -54,7 +55,7 @@ class Backdrop:
         """Fill a few missing pixels from around, many and black borders from what other frames show."""
         if np.count_nonzero(~np.isfinite(pixels)) <= FEW_MISSING * pixels.size:
             pixels = fill_holes(pixels)
-        missing = _missing(pixels, self.black_borders)
+        missing = _missing(pixels, self.black_borders) & np.isfinite(self.values)
         if not missing.any():
             return pixels
         if np.issubdtype(pixels.dtype, np.floating):
@@ -66,7 +67,7 @@ def mean_backdrop(frames: Iterable[PixelArray], shape: tuple[int, ...], black_bo
     """Average what frames show, and continue it smoothly to where none has a value.
 
     ``frames`` (H, W) or (H, W, 3) each, as ``shape`` says; missing pixels are NaN, infinite or, with ``black_borders``,
-    black.  What is black in every frame stays so: it may be part of the scene.
+    black.
     """
     total, count, valued = np.zeros(shape), np.zeros(shape, np.int64), np.zeros(shape, bool)
     for pixels in frames:
@@ -76,7 +77,9 @@ def mean_backdrop(frames: Iterable[PixelArray], shape: tuple[int, ...], black_bo
         valued |= np.isfinite(pixels)
     mean = (total / np.maximum(count, 1)).astype(np.float32)
     unseen = np.asarray(~valued if valued.ndim == 2 else ~valued.all(axis=2))
-    return Backdrop(continued(mean, valued), unseen, black_borders)
+    values = continued(mean, valued)
+    values[valued & (count == 0)] = np.nan
+    return Backdrop(values, unseen, black_borders)
 
 
 def _missing(pixels: PixelArray, black_borders: bool) -> NDArray[np.bool_]:
