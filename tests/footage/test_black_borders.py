@@ -76,6 +76,21 @@ class TestStabilised:
         np.testing.assert_allclose(found[:, 32:38, 24:28], stack[:, 32:38, 24:28] / 255, atol=1e-6)
         assert not report.backdrop.unseen.any()
 
+    def test_a_bar_does_not_grow(self, whole, shown):
+        stack = np.where(shown, whole, 0).astype(np.uint8)
+        stack[:, -12:] = 0
+        report, found = cleaned(stack)
+        assert report.backdrop is not None
+        np.testing.assert_allclose(found[:, -15:-12, 30:40], stack[:, -15:-12, 30:40] / 255, atol=1e-6)
+
+    def test_what_interpolation_has_darkened_is_filled_too(self, whole, shown):
+        soft = [np.stack([cv2.GaussianBlur(one, (3, 3), 0.6) for one in np.where(seen, whole, 0).astype(np.uint8)])
+                for seen in (shown, np.ones_like(shown))]  # fmt: skip
+        _, found = cleaned(soft[0])
+        beside = np.array([cv2.dilate(np.uint8(~one), np.ones((5, 5), np.uint8)) > 0 for one in shown])
+        # Borders of a pixel have no black left.
+        assert np.quantile(np.abs(found - soft[1] / 255)[beside], 0.9) < 0.25
+
     def test_a_blank_frame_does_not_darken_the_fill(self, whole, shown):
         stack = np.where(shown, whole, 0).astype(np.uint8)
         _, found = cleaned(stack)
