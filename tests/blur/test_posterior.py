@@ -148,4 +148,4 @@ def test_weights_and_quantiles_are_in_order():
         assert (np.diff(quantiles) >= 0).all()
     decision = explain_posterior(found, 0.5)
     assert decision.choice == "0.50 pixels removed"
-    assert f"{found.width[1]:.2f} pixels, {found.width[0]:.2f} to {found.width[2]:.2f}" in decision.reason
+    assert f"{found.width[1]:.2f} pixels ({found.width[0]:.2f} to {found.width[2]:.2f})" in decision.reason

@@ -55,9 +55,10 @@ class BlackBorderDetector:
     def found(self) -> bool:
         """Tell whether the frames have black borders that change."""
         fewest = max(_AT_TIMES * self._frames, _FEWEST)
-        changing = np.array([np.mean((counts >= fewest).all(axis=0)) >= _OF_SIDE for counts in self._black])
         bordered = (self._borders >= fewest) & (self._straight >= _STRAIGHT * self._borders)
-        return int(np.sum(changing & bordered)) >= _SIDES
+        changing = [np.mean((counts >= fewest).all(axis=0)) >= _OF_SIDE for counts in self._black]
+        # A mosaic is not looked at.
+        return bool(self._black) and int(np.sum(bordered & changing)) >= _SIDES
 
 
 def black_border(pixels: PixelArray) -> NDArray[np.bool_]:
