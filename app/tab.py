@@ -69,13 +69,13 @@ class Tab:
         self.steadied: Steadied | None = None
         self.rows: list[Row] = []
         self.closed = False
-        self._opening = False
+        self._opening = 0
         self._own: tempfile.TemporaryDirectory[str] | None = None
 
     @property
     def busy(self) -> bool:
         """Whether a run is at work, or a clip is being read: a run that began now would be stopped."""
-        return self._opening or (self.job is not None and self.job.state == "running")
+        return self._opening > 0 or (self.job is not None and self.job.state == "running")
 
     def open(self, path: Path) -> Clip:
         """Look through a clip and make it that of the tab; what was run before is forgotten.
@@ -86,14 +86,14 @@ class Tab:
             It cannot be used.
         """
         uploaded = self._own is not None and path.is_relative_to(self._own.name)
-        self._opening = True
+        self._opening += 1
         try:
             clip = open_clip(path, Path(path.name) if uploaded else self.folders.shown(path))
             self.stop()
             self.clip, self.job, self.restored = clip, None, None
             self.tuned, self.border, self.steadied = None, "keep", None
         finally:
-            self._opening = False
+            self._opening -= 1
         return clip
 
     def place_for(self, name: str) -> Path:

@@ -61,7 +61,7 @@ def prepare(source: FrameSource, static_mask: str = "auto", scratch: Path | None
     survey, levels, range_decisions = stretch_levels(survey)
     clip, object_decisions = without_moving_objects(survey) if static_mask != "off" else (survey.clip, ())
     decisions = (
-        *(Decision("input", "used as read", found) for found in source.warnings if isinstance(found, Doubt)),
+        *(Decision("input", "to be checked", found) for found in source.warnings if isinstance(found, Doubt)),
         *bar_decisions,
         *stripe_decisions,
         *overlay_decisions,

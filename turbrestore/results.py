@@ -14,6 +14,7 @@ from .blur.estimation import BlurEstimate
 from .blur.posterior import BlurPosterior
 from .core.arrays import FloatArray
 from .core.decision import Decision
+from .core.remarks import counted
 from .deconvolution.deconvolve import Deconvolution
 from .display.maps import plot_images
 from .display.preview import preview
@@ -226,7 +227,7 @@ def at_levels_of_clip(result: Result, levels: Levels) -> Result:
 
 
 def _gained(restoration: Restoration, motion: float, gain: float) -> str:
-    count = f"{restoration.frame_count} frames"
+    count = counted(restoration.frame_count, "frame")
     if restoration.is_mean:
         return f"the mean of {count} is the result"
     removed = [f"{motion:.2f} pixels of motion"]

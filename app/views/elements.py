@@ -13,7 +13,7 @@ from nicegui import ui
 from ..folders import printable
 from ..job import one_line
 
-Words = TypeVarTuple("Words")
+Arguments = TypeVarTuple("Arguments")
 Result = TypeVar("Result")
 
 
@@ -81,10 +81,10 @@ class Command:
         self._note.text = "The command is copied; run it in the folder where the app was started."
 
 
-async def in_thread(function: Callable[[*Words], Result], *words: *Words) -> Result:
+async def in_thread(function: Callable[[*Arguments], Result], *arguments: *Arguments) -> Result:
     """Return what a function returns in a thread; a page that was left meanwhile goes no further."""
     content = ui.context.client.content
-    result = await asyncio.to_thread(function, *words)
+    result = await asyncio.to_thread(function, *arguments)
     if content.is_deleted:
         raise asyncio.CancelledError
     return result

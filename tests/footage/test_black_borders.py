@@ -1,5 +1,7 @@
 """Black borders that a stabiliser leaves are filled by what other frames show; a sky, a stop and a shadow stay."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -51,7 +53,7 @@ class TestStabilised:
         if kind == "float32":
             stack /= 255
         report, found = cleaned(stack)
-        assert report.warnings == ("black borders that change from frame to frame: filled by what other frames show",)
+        assert report.warnings == ("black borders that move: filled by what other frames show",)
         stack = stack / np.float32(white)
         # Pixels beside a border may be darkened, and count as part of it.
         inner = np.array([cv2.erode(np.uint8(one), np.ones((13, 13), np.uint8)) > 0 for one in shown])
@@ -105,6 +107,19 @@ class TestStabilised:
         source = FrameSource.from_array(stack)
         assert (clean_source(source, keep_all(check_content(source))).read()[7] == 0).all()
 
+    def test_black_of_a_codec(self, whole, shown):
+        noise = np.random.default_rng(9).integers(0, 4, whole.shape, np.uint8)
+        report, found = cleaned(np.where(shown, whole, noise))
+        assert report.backdrop is not None
+        assert found.min() > 0.1
+
+    def test_missing_values_beside_a_border(self, whole, shown):
+        stack = np.where(shown, whole, 0) / np.float32(255)
+        stack[:, :, :4] = 0
+        stack[6, :, 20:34] = np.nan
+        _, found = cleaned(stack)
+        assert np.isfinite(found).all()
+
     def test_strict_refuses_them(self, whole, shown):
         with pytest.raises(DataError, match="black borders"):
             cleaned(np.where(shown, whole, 0).astype(np.uint8), strict=True)
@@ -119,6 +134,12 @@ class TestStabilised:
         np.testing.assert_array_equal(clean_source(source, keep_all(report)).read(), source.read())
 
 
+def unchanged(stack):
+    """Expect nothing to be found, and no frame to be left out."""
+    report = check_content(FrameSource.from_array(stack))
+    assert (report.backdrop, report.warnings, report.left_out) == (None, (), frozenset())
+
+
 class TestNoBorder:
     @pytest.mark.parametrize("radius", [0.5, 0.8, 1.0, 1.2, 1.5])
     @pytest.mark.parametrize("size", [0.05, 0.15, 0.4])
@@ -128,6 +149,44 @@ class TestNoBorder:
         discs = [radius * side / 2 - np.hypot(x - right, y - down) for right, down, _ in shakes(2, size * side)]
         stack = np.uint8(np.clip(np.array(discs) / 2, 0, 1) * (150 + 50 * np.sin(x / 4) * np.sin(y / 3)))
         assert check_content(FrameSource.from_array(stack)).backdrop is None
+
+    def test_a_bright_board_and_a_star_on_black(self):
+        board = np.zeros((COUNT, SIDE, SIDE), np.uint8)
+        board[:, 20:50, 20:50] = np.random.default_rng(5).normal(150, 5, (COUNT, 30, 30))
+        unchanged(board)
+        star = 200 * np.exp(-(np.hypot(X - 5, Y + 3) ** 2) / 4) + np.random.default_rng(6).normal(3, 2, board.shape)
+        unchanged(np.uint8(star.clip(0)))
+
+    def test_a_lens_cap(self, whole):
+        stack = whole.copy()
+        stack[3] = np.random.default_rng(7).normal(4, 2, (SIDE, SIDE)).clip(0)
+        report = check_content(FrameSource.from_array(stack))
+        assert (report.backdrop, report.blank, len(report.scenes)) == (None, (3,), 1)
+
+    @pytest.mark.parametrize("width", [4, 8])
+    def test_a_scene_in_a_fixed_box_after_one_without(self, whole, width):
+        waves = 128 + 100 * np.sin(X / 2 + Y / 6) + np.random.default_rng(8).normal(0, 2, (10, SIDE, SIDE))
+        boxed = whole[10:].copy()
+        for side in (boxed.transpose(1, 2, 0), boxed.transpose(2, 1, 0)):
+            side[:width] = side[-width:] = 0
+        report = check_content(FrameSource.from_array(np.concatenate([np.uint8(waves), boxed])))
+        assert (report.backdrop, len(report.scenes)) == (None, 2)
+
+    def test_one_frame_that_was_moved(self, whole):
+        stack = whole.copy()
+        stack[5, :9] = stack[5, -9:] = stack[5, :, :9] = 0
+        stack[6, :6] = 0
+        assert check_content(FrameSource.from_array(stack)).backdrop is None
+
+    @pytest.mark.parametrize("shape", [(1, 1), (2, 50), (50, 2), (6, 6), (5, 20)])
+    def test_tiny_frames(self, shape):
+        stack = np.random.default_rng(8).integers(5, 255, (6, *shape), np.uint8)
+        stack[:, 0, 0] = 0
+        assert check_content(FrameSource.from_array(stack)).backdrop is None
+
+    def test_mosaics_are_not_looked_at(self, whole, shown):
+        source = FrameSource.from_array(np.where(shown, whole, 0).astype(np.uint8))
+        assert check_content(dataclasses.replace(source, develop=lambda pixels: pixels)).backdrop is None
 
     def test_a_sky_of_noise_around_zero(self):
         for mean in (-60, -40, -20, 5):

@@ -118,7 +118,7 @@ class TestPage:
     def test_doubts_stand_at_the_top(self, whole, run):
         sure = render_report(dataclasses.replace(whole, guard_readings=()), run)
         doubt, remark = "cut short after 6 whole frames; the others are missing", "1 duplicated: frame 3 left out"
-        doubted = dataclasses.replace(whole, decisions=(Decision("input", "used as read", doubt),))
+        doubted = dataclasses.replace(whole, decisions=(Decision("input", "to be checked", doubt),))
         page = render_report(doubted, dataclasses.replace(run, warnings=(doubt, remark)))
         assert page.index(f"<li>{doubt}</li>") < page.index(f"Remark: {remark}") < page.index('<dl class="headline">')
         assert page.count(remark) == 1 and f"Remark: {doubt}" not in page

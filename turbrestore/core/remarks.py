@@ -1,8 +1,8 @@
-"""What is said about a clip: remarks that are in doubt, and counts."""
+"""Words about a clip: remarks that a person has to check, and counts."""
 
 
 class Doubt(str):
-    """A remark on a clip that a person has to check; others say what was done, and need no attention."""
+    """A remark that a person has to check; other remarks only say what was done."""
 
     __slots__ = ()
 

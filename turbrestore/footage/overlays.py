@@ -48,8 +48,8 @@ _LEAST_MOTION = 3.0
 # An edge is static if it varies by less than its gradient times this share of the motion of the edges, or one pixel,
 # and if its gradient is that many times the noise; with a static camera, the edges move by at least so many pixels.
 _STATIC, _DEVIATIONS, _LEAST_BENDING = 1 / 3, 8.0, 0.3
-# Deviation of a static pixel, in units of the noise of a frame, if that is more than a grey level; part of the scale
-# that a clip spans between these percentiles if its grey level is that of 8 bits.
+# Deviation of a static pixel, in units of the noise of a frame.  The least change that counts is one level of 8 bits,
+# or less in a clip whose range, between these percentiles, is below this share of full scale.
 _STILL, _SPAN, _RANGE = 2.5, 0.5, (1, 99)
 # Largest deviation of pixels without noise, in units of the noise, and level of a dark stop, from black to the scene.
 _CONSTANT, _DARK = 0.5, 0.25
@@ -247,7 +247,7 @@ def _static_regions(
 
 
 def _grey_level(survey: Survey, moments: Moments) -> float:
-    """Least change that counts: a level of 8 bits or, where a file has finer steps and a clip spans little, less."""
+    """Least change that counts: one level of 8 bits, or less for a dim clip of finer steps."""
     low, high = np.percentile(luminance(moments.mean), _RANGE)
     # The numbers of a file may be of fewer bits than its type.
     step = np.diff(np.unique(survey.pixels[0])).min(initial=survey.clip.full_scale) / survey.clip.full_scale

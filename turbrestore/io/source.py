@@ -54,7 +54,8 @@ class FrameSource:
     timestamps : ndarray, float64, shape (T,), or None
         Seconds since the first frame of the file, after the selection.
     warnings : tuple of str
-        What was left out, or is unusual; those that a person has to check are of the type :class:`Doubt`.
+        What was left out, or is unusual; those that a person has to check are of the type
+        ``turbrestore.core.remarks.Doubt``.
     damaged : tuple of int
         Numbers, in the file, of frames that are known to be damaged.
     levels : tuple of float or None

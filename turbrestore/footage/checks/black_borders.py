@@ -1,76 +1,93 @@
-"""Black borders of a clip whose frames a stabiliser or an editor has moved, and left black where they show nothing.
+"""Finds the black borders that a stabiliser or an editor leaves where a moved frame shows nothing.
 
-A border is straight, and black in some frames where others show the scene, on at least three sides and along most of
-them.  A planet that the wind shakes has a round edge; a field stop, a bar and a shadow stay.  Flow would bend a border
-into the scene, and fusion would darken the result.
+Such a border has a straight edge, moves, and is black in some frames where others show the scene, on at least three
+sides and along most of them.  The edge of a shaking planet is round; field stops, bars and shadows do not move.  Flow
+would bend a border into the scene, and fusion would darken the result.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...io.pixels import PixelArray
 
-# Largest level of black in 8 bits, after a codec, and pixels beside it that a codec or an interpolation has darkened.
+# Highest 8-bit level that counts as black, because codecs add noise, and width, in pixels, of the rim that codecs and
+# interpolation darken.
 _BLACK_OF_CODEC, _DARKENED = 4, 3
-# Narrowest border, pixels; least share and number of the frames that have it, and of those that do not.
+# A border is at least so many pixels wide, and moves by as many; it occurs, and is absent, in this share and number of
+# the frames.
 _NARROWEST, _AT_TIMES, _FEWEST = 3, 0.02, 2
-# Least share of a side that is black in such a frame, and that is black at times, and least number of such sides.
+# It takes this share of a side in such a frame, and at times, on so many sides.
 _OF_SIDE, _SIDES = 0.5, 3
-# The edge is a line through a place in either outer third of a border, where this share of it is narrower.  It is bent,
-# as an arc, if more than a share of it is so many pixels before the line, and noise, if more than another is beyond.
+# Its edge is the line through this quantile of the widths in either outer third.  If a larger share of the widths is so
+# many pixels short of the line, it is an arc; if a larger share is beyond, it is noise.
 _NARROW, _OFF_LINE, _BEFORE, _BEYOND = 0.1, 2.0, 0.05, 0.4
-# Least share of the borders whose edge is straight.
+# Least share of the borders that have a straight edge.
 _STRAIGHT = 0.5
 
 
 class BlackBorderDetector:
-    """Counts, along the sides of the frames, where they are black, and in how many frames the edge is straight."""
+    """Counts, along the sides of the frames, where they are black, and how often the edge is straight and where."""
 
     def __init__(self) -> None:
         self._frames = 0
         # Frames that are black and frames that are not, for every pixel of four sides; borders, and straight ones.
         self._black: list[NDArray[np.int64]] = []
         self._borders, self._straight = np.zeros((2, 4), np.int64)
+        # Least and largest width of a border in the middle of a side.
+        self._least, self._most = np.full(4, np.inf), np.full(4, -np.inf)
 
-    def update(self, pixels: PixelArray) -> None:
-        """Look at the next frame, shape (H, W) or (H, W, 3)."""
+    def update(self, pixels: PixelArray) -> NDArray[np.bool_]:
+        """Look at the next frame, shape (H, W) or (H, W, 3), and mark, (H, W), its black borders."""
         self._frames += 1
-        black, sides = _black(pixels), _sides(pixels)
+        marked, black, sides = np.zeros(pixels.shape[:2], bool), _black(pixels), _sides(pixels)
         self._black = self._black or [np.zeros((2, side.shape[1]), np.int64) for side in sides]
-        for number, side in enumerate(sides):
+        for number, (side, place) in enumerate(zip(sides, _sides(marked), strict=True)):
+            edge = _mark(side, place, black)
             strip = _level(side[:_NARROWEST])
             dark = strip.max(axis=0) <= black
             if dark.mean() >= _OF_SIDE:
-                shown = _level(side[: len(side) // 2]) > black
-                if not shown.any():
+                if edge is None and _level(side).max() <= black:
                     continue
                 self._borders[number] += 1
-                self._straight[number] += _edge(shown) is not None
+                if edge is not None:
+                    self._straight[number] += 1
+                    middle = edge[len(edge) // 2]
+                    self._least[number] = min(self._least[number], middle)
+                    self._most[number] = max(self._most[number], middle)
             self._black[number] += dark, strip[0] > black
+        return marked
 
     def found(self) -> bool:
-        """Tell whether the frames have black borders that change."""
+        """Tell whether the frames have black borders that move."""
+        if not self._frames or np.max(self._most - self._least) < _NARROWEST:
+            return False
         fewest = max(_AT_TIMES * self._frames, _FEWEST)
+        changing = np.array([np.mean((counts >= fewest).all(axis=0)) >= _OF_SIDE for counts in self._black])
         bordered = (self._borders >= fewest) & (self._straight >= _STRAIGHT * self._borders)
-        changing = [np.mean((counts >= fewest).all(axis=0)) >= _OF_SIDE for counts in self._black]
-        # A mosaic is not looked at.
-        return bool(self._black) and int(np.sum(bordered & changing)) >= _SIDES
+        return int(np.sum(changing & bordered)) >= _SIDES
 
 
 def black_border(pixels: PixelArray) -> NDArray[np.bool_]:
     """Mark, (H, W), the black borders of a frame, with the pixels beside them."""
-    marked, black = np.zeros(pixels.shape[:2], bool), _black(pixels)
+    marked = np.zeros(pixels.shape[:2], bool)
     for side, place in zip(_sides(pixels), _sides(marked), strict=True):
-        dark = _level(side[:1])[0] <= black
-        edge = _edge(_level(side[: len(side) // 2]) > black) if dark.any() else None
-        if edge is not None:
-            near = np.convolve(dark, np.ones(2 * _DARKENED + 1), "same") > 0
-            place[near & (np.arange(len(place))[:, None] < edge + _DARKENED)] = True
+        _mark(side, place, _black(pixels))
     return marked
+
+
+def _mark(side: PixelArray, place: NDArray[np.bool_], black: int) -> NDArray[np.float64] | None:
+    """Mark the black border in the first rows of a frame, with its rim; return its edge, if that is straight."""
+    dark = _level(side[:1]) <= black
+    edge = _edge(_level(side[: -(-len(side) // 2)]) > black) if dark.any() else None
+    if edge is not None:
+        near = cv2.dilate(dark.astype(np.uint8), np.ones((1, 2 * _DARKENED + 1), np.uint8)) > 0
+        place[near & (np.arange(len(place))[:, None] < edge + _DARKENED)] = True
+    return edge
 
 
 def _edge(shown: NDArray[np.bool_]) -> NDArray[np.float64] | None:

@@ -4,7 +4,7 @@
 defect                criterion                                                          :func:`clean_source`
 ====================  =================================================================  =============================
 NaN, infinite values  in up to 1 % of a frame; more raises DataError                     fills them from around
-black borders         black in some frames along most of three sides                     shows what others do
+black borders         straight and moving, along most of three sides                     filled from other frames
 stuck pixels          outside the range of their neighbours in every frame               median of the neighbours
 duplicated frames     every value equals that of the frame before                        leaves them out
 blank frames          a tenth of the usual contrast or less: lens cap, flash, dropout    leaves them out
@@ -13,7 +13,7 @@ saturation            half of the values or more are white                      
 ====================  =================================================================  =============================
 
 :func:`without_blank` finds blank frames alone, and leaves them out.
-Each of scene_cuts, stuck_pixels, repeats, black_borders and missing_pixels, beside this module, describes one of them.
+The modules scene_cuts, stuck_pixels, repeats, black_borders and missing_pixels each detect one of these defects.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from ...core.errors import ConfigurationError, DataError, require_between
 from ...core.remarks import Doubt, counted
 from ...io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
 from ...io.source import FrameSource, numbers_text
-from .black_borders import BlackBorderDetector, black_border
+from .black_borders import BlackBorderDetector
 from .missing_pixels import FEW_MISSING, MOST_MISSING, Backdrop, fill_holes, mean_backdrop
 from .repeats import RepeatDetector
 from .scene_cuts import Scene, SceneDetector, group_scenes, thumbnail
@@ -106,7 +106,7 @@ class ContentReport:
     warnings : tuple of str
         The defects and what is done about them; empty for a clean video.
     backdrop : Backdrop or None
-        What frames show behind pixels that others lack; None where no frame lacks more than a hundredth, or has black
+        What frames show behind pixels that others lack; None if no frame lacks more than 1 % and there are no black
         borders.
     """
 
@@ -195,10 +195,11 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
 
 def _of_file(backdrop: Backdrop, source: FrameSource) -> Backdrop:
     """Bring a backdrop of the selected rows and columns to the size of the frames in the file."""
-    values = np.zeros(source.file_shape[1:], np.float32)
+    values, black = np.zeros(source.file_shape[1:], np.float32), np.zeros(source.file_shape[1:], bool)
     unseen = np.zeros(source.file_shape[1:3], bool)
-    values[source.window], unseen[source.window] = backdrop.values, backdrop.unseen
-    return dataclasses.replace(backdrop, values=values, unseen=unseen)
+    values[source.window], black[source.window] = backdrop.values, backdrop.black
+    unseen[source.window] = backdrop.unseen
+    return dataclasses.replace(backdrop, values=values, unseen=unseen, black=black)
 
 
 def without_blank(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
@@ -214,7 +215,7 @@ def keep_all(report: ContentReport) -> ContentReport:
     """Return the report for a use that keeps every frame: defects are repaired, and nothing is left out."""
     backdrop = report.backdrop
     if backdrop is not None and len(report.scenes) > 1:
-        # Other scenes stand before another backdrop.
+        # The backdrop is that of one scene; it must not show in the others.
         backdrop = dataclasses.replace(backdrop, black_borders=False)
     kept = dataclasses.replace(
         report, blank=(), duplicated=(), scenes=report.scenes[:1], left_out=frozenset(), backdrop=backdrop
@@ -237,9 +238,11 @@ class _ContentScan:
         self._repeats = RepeatDetector()
         self._needs_backdrop = False
         self._borders = BlackBorderDetector()
-        self._thumb: FloatArray | None = None
         self._stuck = StuckPixelDetector(params.stuck_excess)
         self._scenes = SceneDetector(params.cut_similarity)
+        # The same for a clip with black borders, whose thumbnails are compared without them.
+        self._bordered_scenes = SceneDetector(params.cut_similarity)
+        self._shown: FloatArray | None = None
 
     def update(self, number: int, pixels: PixelArray, mosaic: PixelArray | None) -> None:
         pixels = self._with_holes_filled(number, pixels)
@@ -249,13 +252,12 @@ class _ContentScan:
             self._duplicated.append(number)
         self._previous = pixels
         self._repeats.update(values)
-        thumb = thumbnail(values)
+        thumb = shown = thumbnail(values)
         if mosaic is None:
-            self._borders.update(pixels)
-            border = black_border(pixels)
+            border = self._borders.update(pixels)
             if border.any():
-                thumb = _without_border(thumb, border, np.zeros_like(thumb) if self._thumb is None else self._thumb)
-            self._thumb = thumb
+                shown = _without_border(thumb, border, np.zeros_like(thumb) if self._shown is None else self._shown)
+            self._shown = shown
         contrast = float(thumb.std())
         self._contrasts.append(contrast)
         # A running estimate of the median, because blank frames must reach neither the scenes nor the stuck pixels.
@@ -264,15 +266,18 @@ class _ContentScan:
             # Stuck pixels are isolated in the mosaic; interpolation of colours spreads them.
             self._stuck.update(values if mosaic is None else self._planes(mosaic))
             self._scenes.update(thumb)
+            self._bordered_scenes.update(shown)
         else:
             self._scenes.skip()
+            self._bordered_scenes.skip()
 
     def report(self) -> ContentReport:
         numbers = np.asarray(self._source.numbers)
         contrasts = np.frombuffer(self._contrasts)
         blank = _are_blank(contrasts, self._params.blank_contrast)
         duplicated = np.isin(numbers, self._duplicated) | self._repeats.found()
-        labels = np.where(blank, -1, self._scenes.labels())
+        borders = self._borders.found()
+        labels = np.where(blank, -1, (self._bordered_scenes if borders else self._scenes).labels())
         scenes, used = group_scenes(numbers, labels)
         left_out = blank | ~used
         # In a video of one repeated frame there are no others to use.
@@ -285,7 +290,7 @@ class _ContentScan:
         else:
             stuck[:, 0] += rows.start
             stuck[:, 1] += columns.start
-        backdrop, borders = None, self._borders.found()
+        backdrop = None
         if self._needs_backdrop or borders:
             # Frames that are used are read again, as few clips lack so much.
             frames = self._source.without(numbers[left_out].tolist(), "").native()
@@ -332,7 +337,7 @@ class _ContentScan:
 
 
 def _without_border(thumb: FloatArray, border: NDArray[np.bool_], before: FloatArray) -> FloatArray:
-    """Put the thumbnail before into what a black border covers, because a border that changes is no cut."""
+    """Cover a black border with the previous thumbnail, so that a changing border is not taken for a cut."""
     covered = cv2.resize(border.astype(np.float32), thumb.shape[::-1], interpolation=cv2.INTER_AREA) > 0
     if covered.all():
         return thumb
@@ -349,7 +354,7 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
         how = "from around" if report.backdrop is None else _how_filled(report)
         lines.append(f"{counted(report.filled_values, 'NaN or infinite value')} in {where}: filled {how}")
     if report.backdrop is not None and report.backdrop.black_borders:
-        lines.append("black borders that change from frame to frame: filled by what other frames show")
+        lines.append("black borders that move: filled by what other frames show")
     if len(report.stuck):
         places = "; ".join(f"x {place[1]}, y {place[0]}" for place in report.stuck[:3])
         places += "; …" * (len(report.stuck) > 3)

@@ -45,17 +45,17 @@ def fill_holes(pixels: PixelArray) -> PixelArray:
 class Backdrop:
     """What frames show behind the pixels that others lack."""
 
-    # (H, W) or (H, W, 3): mean over the frames that have a value; where none has one, that of the pixels around.  NaN
-    # where every frame is black: that may be the scene.
+    # (H, W) or (H, W, 3): mean over the frames that have a value; where none has one, that of the pixels around.
     values: FloatArray
     unseen: NDArray[np.bool_]  # (H, W): pixels that no frame has
+    black: NDArray[np.bool_]  # of the shape of the values: where all frames have a border; the scene may be black there
     black_borders: bool  # whether frames lack what is black along their borders, too
 
     def behind(self, pixels: PixelArray) -> PixelArray:
-        """Fill a few missing pixels from around, many and black borders from what other frames show."""
+        """Fill a few missing pixels from around, and many of them, or black borders, from other frames."""
         if np.count_nonzero(~np.isfinite(pixels)) <= FEW_MISSING * pixels.size:
             pixels = fill_holes(pixels)
-        missing = _missing(pixels, self.black_borders) & np.isfinite(self.values)
+        missing = ~np.isfinite(pixels) | (_missing(pixels, self.black_borders) & ~self.black)
         if not missing.any():
             return pixels
         if np.issubdtype(pixels.dtype, np.floating):
@@ -69,17 +69,15 @@ def mean_backdrop(frames: Iterable[PixelArray], shape: tuple[int, ...], black_bo
     ``frames`` (H, W) or (H, W, 3) each, as ``shape`` says; missing pixels are NaN, infinite or, with ``black_borders``,
     black.
     """
-    total, count, valued = np.zeros(shape), np.zeros(shape, np.int64), np.zeros(shape, bool)
+    total, count, valued = np.zeros(shape), np.zeros(shape, np.int32), np.zeros(shape, bool)
     for pixels in frames:
         known = ~_missing(pixels, black_borders)
-        total[known] += pixels[known]
+        np.add(total, pixels, out=total, where=known)
         count += known
         valued |= np.isfinite(pixels)
     mean = (total / np.maximum(count, 1)).astype(np.float32)
     unseen = np.asarray(~valued if valued.ndim == 2 else ~valued.all(axis=2))
-    values = continued(mean, valued)
-    values[valued & (count == 0)] = np.nan
-    return Backdrop(values, unseen, black_borders)
+    return Backdrop(continued(mean, valued), unseen, valued & (count == 0), black_borders)
 
 
 def _missing(pixels: PixelArray, black_borders: bool) -> NDArray[np.bool_]:

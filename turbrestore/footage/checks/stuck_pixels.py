@@ -1,9 +1,10 @@
 """Detection and repair of hot and dead pixels.
 
 A stuck pixel differs from a small detail of the scene in one of two ways: its neighbours show nothing of it, although a
-lens and motion would spread a detail; or it never changes while its neighbours do.  So does the end of a letter of a
-title, but the letter covers part of a neighbour.  Pairs, clusters, pixels at the border, and pixels that a lossy codec
-has spread are not found.  Those of a Bayer sensor are looked for in its mosaic, among the neighbours of their colour.
+lens and motion would spread a detail; or it never changes while its neighbours do.  The end of a letter of a title
+looks the same, but the letter also covers part of a neighbour.  Pairs, clusters, pixels at the border, and pixels that
+a lossy codec has spread are not found.  Those of a Bayer sensor are looked for in its mosaic, among the neighbours of
+their colour.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _DENSE_FRAMES = 8
 _ALONE = 0.8
 # Largest change of a stuck pixel, and least mean change of its neighbours.
 _STILL, _MOVING = 1.5 / 255, 8 / 255
-# Share of its distance from the median of all neighbours that one of them has in every frame, if both are of a letter.
+# A neighbour belongs to the same letter if it always stands out by at least this share of the height of the pixel.
 _OF_LETTER = 0.3
 _RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 _AROUND = np.array([(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)])
