@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from ...io.pixels import PixelArray
 
-# Highest 8-bit level that counts as black, because codecs add noise, and width, in pixels, of the rim that codecs and
-# interpolation darken.
-_BLACK_OF_CODEC, _DARKENED = 4, 3
+# Highest 8-bit level that counts as black, because codecs add noise; size, in pixels, from which brighter spots are not
+# of a codec; and width, in pixels, of the rim that codecs and interpolation darken.
+_BLACK_OF_CODEC, _SPOT, _DARKENED = 4, 3, 3
 # A border is at least so many pixels wide, and moves by as many; it occurs, and is absent, in this share and number of
 # the frames.
 _NARROWEST, _AT_TIMES, _FEWEST = 3, 0.02, 2
@@ -25,7 +25,7 @@ _NARROWEST, _AT_TIMES, _FEWEST = 3, 0.02, 2
 _OF_SIDE, _SIDES = 0.5, 3
 # Its edge is the line through this quantile of the widths in either outer third.  If a larger share of the widths is so
 # many pixels short of the line, it is an arc; if a larger share is beyond, it is noise.
-_NARROW, _OFF_LINE, _BEFORE, _BEYOND = 0.1, 2.0, 0.05, 0.4
+_NARROW, _OFF_LINE, _BEFORE, _BEYOND = 0.25, 2.0, 0.15, 0.4
 # Least share of the borders that have a straight edge.
 _STRAIGHT = 0.5
 
@@ -83,7 +83,10 @@ def black_border(pixels: PixelArray) -> NDArray[np.bool_]:
 def _mark(side: PixelArray, place: NDArray[np.bool_], black: int) -> NDArray[np.float64] | None:
     """Mark the black border in the first rows of a frame, with its rim; return its edge, if that is straight."""
     dark = _level(side[:1]) <= black
-    edge = _edge(_level(side[: -(-len(side) // 2)]) > black) if dark.any() else None
+    if not dark.any():
+        return None
+    shown = (_level(side[: -(-len(side) // 2)]) > black).astype(np.uint8)
+    edge = _edge(cv2.morphologyEx(shown, cv2.MORPH_OPEN, np.ones((_SPOT, _SPOT), np.uint8)) > 0)
     if edge is not None:
         near = cv2.dilate(dark.astype(np.uint8), np.ones((1, 2 * _DARKENED + 1), np.uint8)) > 0
         place[near & (np.arange(len(place))[:, None] < edge + _DARKENED)] = True
