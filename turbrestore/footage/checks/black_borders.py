@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...io.pixels import PixelArray
 
 # Highest 8-bit level that counts as black, because codecs add noise; size, in pixels, from which brighter spots are not
-# of a codec; and width, in pixels, of the rim that codecs and interpolation darken.
+# noise; and width, in pixels, of the rim that codecs and interpolation darken.
 _BLACK_OF_CODEC, _SPOT, _DARKENED = 4, 3, 3
 # A border is at least so many pixels wide, and moves by as many; it occurs, and is absent, in this share and number of
 # the frames.
@@ -24,8 +24,8 @@ _NARROWEST, _AT_TIMES, _FEWEST = 3, 0.02, 2
 # It takes this share of a side in such a frame, and at times, on so many sides.
 _OF_SIDE, _SIDES = 0.5, 3
 # Its edge is the line through this quantile of the widths in either outer third.  If a larger share of the widths is so
-# many pixels short of the line, it is an arc; if a larger share is beyond, it is noise.
-_NARROW, _OFF_LINE, _BEFORE, _BEYOND = 0.25, 2.0, 0.15, 0.4
+# many pixels short of the line, it is an arc.
+_NARROW, _OFF_LINE, _BEFORE = 0.25, 2.0, 0.15
 # Least share of the borders that have a straight edge.
 _STRAIGHT = 0.5
 
@@ -109,8 +109,7 @@ def _edge(shown: NDArray[np.bool_]) -> NDArray[np.float64] | None:
     )
     slope = (widths[right] - widths[left]) / max(places[right] - places[left], 1)
     edge = np.asarray(widths[left] + slope * (np.arange(shown.shape[1]) - places[left]), np.float64)
-    off = widths - edge[places]
-    return edge if np.mean(off < -_OFF_LINE) <= _BEFORE and np.mean(off > _OFF_LINE) <= _BEYOND else None
+    return edge if np.mean(edge[places] - widths > _OFF_LINE) <= _BEFORE else None
 
 
 def _sides(pixels: NDArray[Any]) -> tuple[NDArray[Any], ...]:
