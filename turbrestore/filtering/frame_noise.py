@@ -61,6 +61,7 @@ class FrameStatistics:
     """Temporal statistics of the registered frames of the first block, which Z of every frame is measured against."""
 
     image_noise: float  # Z₀, squared intensity
+    frame_noise: float  # standard deviation of the noise of a frame, smooth or not, intensity
     template: Stack  # (2, H, W): gradient along x and y of the image that frames are registered to, intensity per pixel
     template_energy: float  # sum of its square
     # (H, W): mean over the frames of the local sharpness where they agree, see :func:`project_gradient`.

@@ -11,14 +11,17 @@ for a median, which moving objects do not change.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy
 
 from ..core.arrays import FloatArray, luminance
 from ..core.noise import fit_noise_curve
+from ..core.noise_spectrum import NoiseSpectrum
+from ..registration.noise_of_frames import noise_of_frames
 from ..registration.warp import warp
 from ..runtime.scratch import iter_frames
 from ..runtime.threads import map_ahead, sum_in_threads
@@ -64,8 +67,8 @@ class _SharpnessMoments:
 
 
 def measure_frame_statistics(
-    frames: Iterable[FloatArray],
-    flows: Iterable[FloatArray],
+    frames: Sequence[FloatArray],
+    flows: Sequence[FloatArray],
     image: FloatArray,
     window: float = 3.0,
     image_noise: float | None = None,
@@ -95,12 +98,15 @@ def measure_frame_statistics(
     energy = smooth(square, window)
     sensor_noise = fit_noise_curve(mean, np.where(covered, variance, fine), energy).variance(mean)
     mean_frame, deviation, moments = _without_outliers(frames, flows, mean, variance, template, window, threads)
-    sharpness, spread, explained, left_out = _leave_middle_out(moments, template, energy, sensor_noise, window)
+    noise = noise_of_frames(frames, flows, mean_frame)
+    coloured = _coloured(template, noise)
+    sharpness, spread, explained, left_out = _leave_middle_out(moments, coloured, sensor_noise, window)
     scale = _score_scale(sharpness, spread, explained)
     weight = _sharpness_weight(sharpness, spread - explained, scale**2 * spread, float(sensor_noise.mean()) / count)
     # Near a moving object the flow follows it, and a frame may be sharp without showing the scene.
     scale *= 1 - smooth(covered.astype(np.float32), window)
     return FrameStatistics(
+        frame_noise=noise.deviation,
         image_noise=max(float(variance.mean()) if image_noise is None else image_noise, _IMAGE_NOISE_FLOOR),
         template=template,
         template_energy=float(square.sum(dtype=np.float64)),
@@ -130,7 +136,7 @@ def _mean_and_variance(
 
 
 def _median_and_spread(
-    frames: Iterable[FloatArray], flows: Iterable[FloatArray], shape: tuple[int, ...], count: int, threads: int
+    frames: Sequence[FloatArray], flows: Sequence[FloatArray], shape: tuple[int, ...], count: int, threads: int
 ) -> tuple[FloatArray, FloatArray, np.ndarray]:
     """Median of some registered frames, their squared median deviation as a variance, and their variance in detail."""
     picked = set(np.linspace(0, count - 1, min(count, _RESERVOIR)).round().astype(int).tolist())
@@ -185,8 +191,8 @@ def _robust_start(
 
 
 def _without_outliers(
-    frames: Iterable[FloatArray],
-    flows: Iterable[FloatArray],
+    frames: Sequence[FloatArray],
+    flows: Sequence[FloatArray],
     mean: np.ndarray,
     variance: np.ndarray,
     template: FloatArray,
@@ -230,14 +236,23 @@ def _deviation(variance: np.ndarray, window: float = OUTLIER_WINDOW) -> FloatArr
     return smooth(variance.astype(np.float32), window) + np.float32(floor)
 
 
+def _coloured(template: FloatArray, noise: NoiseSpectrum) -> FloatArray:
+    """Template on which white noise projects as noise of a spectrum and of the same variance does on ``template``."""
+    frequency = np.hypot(np.fft.fftfreq(template.shape[1])[:, None], np.fft.rfftfreq(template.shape[2]))
+    response = np.sqrt(noise.at(frequency)) / noise.deviation
+    spectrum = scipy.fft.rfft2(template) * response.astype(np.float32)
+    return np.asarray(scipy.fft.irfft2(spectrum, s=template.shape[1:]), np.float32)
+
+
 def _leave_middle_out(
-    moments: _SharpnessMoments, template: FloatArray, energy: FloatArray, noise: FloatArray, window: float
+    moments: _SharpnessMoments, template: FloatArray, noise: FloatArray, window: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Mean and variance of the local sharpness, the part of the variance that noise explains, and κ.
 
     κ grows with that part: without noise the middle of the window is where the sharpness of a pixel shows best.  Noise
     n of variance ``noise`` adds ``Σ g t · ∇n = −Σ n ∇·(g t)`` to the sharpness, with t the template, g the window.
     """
+    energy = smooth(template[0] ** 2 + template[1] ** 2, window)
     divergence = smooth((gradient(template[0])[0] + gradient(template[1])[1]) ** 2, window / np.sqrt(2))
     # ∫ g² and, along one axis, ∫ (∇g)² of a Gaussian of deviation s are 1 / (4π s²) and 1 / (8π s⁴).
     inside, border = noise * divergence / (4 * np.pi * window**2), noise * energy / (8 * np.pi * window**4)

@@ -37,6 +37,7 @@ from ..runtime.threads import map_ahead, sum_in_threads
 from .camera.stabilisation import mean_stabilised
 from .flow import FlowFrame, FlowParams, measure_flows, normalise_contrast, prepare_reference
 from .flow_algebra import compose_flows, invert_flow
+from .noise_of_frames import noise_of_frames
 from .warp import inside, warp
 
 if TYPE_CHECKING:
@@ -216,7 +217,9 @@ def centroid_steps(
         last = len(sizes) + 1 == params.iterations
         draft = fused and not last and (not sizes or (far and len(sizes) % 2 == 0))
         starts = repeat(None) if draft or not sizes else iter_frames(flows)
-        reference = prepare_reference(image, flow_params, runtime)
+        # Only frames that are registered tell smooth noise from detail.
+        noise = noise_of_frames(stack, flows, image).deviation if sizes else 0.0
+        reference = prepare_reference(image, flow_params, runtime, noise)
         solved = measure_flows(reference, prepared or iter_frames(stack), starts, draft)
         if draft and sizes:
             solved = _better_flows(image, solved, iter_frames(flows), runtime.threads)

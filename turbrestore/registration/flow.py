@@ -198,9 +198,12 @@ def measure_flows(
 
 
 def prepare_reference(
-    reference: ArrayLike, params: FlowParams | None = None, runtime: Runtime = DEFAULT
+    reference: ArrayLike, params: FlowParams | None = None, runtime: Runtime = DEFAULT, least_noise: float = 0.0
 ) -> FlowReference:
-    """Prepare the image (H, W[, 3]) that flows start from."""
+    """Prepare the image (H, W[, 3]) that flows start from.
+
+    Frames have at least the noise ``least_noise``, intensity: a single one does not tell smooth noise from detail.
+    """
     params = params or FlowParams()
     target = check_image(reference, "reference")
     if min(target.shape[:2]) < MIN_SIDE:
@@ -237,7 +240,7 @@ def prepare_reference(
         placed, starts, shifts = zip(*(_place(frame, normalised, position) for frame in usable), strict=True)
         flows = list(solver(np.stack(placed), list(starts), draft))
         if confidence is not None:
-            flows = [regularise_flow(f, confidence, frame.noise) for f, frame in zip(flows, batch, strict=True)]
+            flows = [regularise_flow(f, confidence, max(frame.noise, least_noise)) for f, frame in zip(flows, batch, strict=True)]
         return [flow + shift if shift.any() else flow for flow, shift in zip(flows, shifts, strict=True)]
 
     # A device solves a batch at once while others are prepared; on the CPU every frame has a thread.

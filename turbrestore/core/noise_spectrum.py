@@ -1,0 +1,119 @@
+"""The spectrum of the noise: how much of it there is at every spatial frequency.
+
+Symbols
+-------
+d : difference of two images of one scene, such as a registered frame less the mean of all, or half the difference of
+    the means of two halves of a clip
+m : the scene, as the mean of the frames shows it
+N : power spectrum of the noise of d, squared intensity; that of white noise of variance n² is n² at every frequency
+e : share of the power of the scene by which d differs too, because the images are not registered exactly
+
+In a window, the expected power spectra of d and m at a frequency are ``P_d = N + e P_m``.  Windows differ in P_m, so they
+tell both: N is what flat ones have, e what those with detail have beyond it.  Both follow, for every ring of frequencies,
+by least squares in which a window counts by the inverse of its variance, which is proportional to (N + e P_m)².
+
+A camera's noise reduction, a codec, a digital zoom, demosaicing, film grain and the interpolation of the registration
+all make noise that is smooth: N falls with the frequency.  Differences of neighbouring pixels do not see such noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from .arrays import FloatArray
+
+# Side of a window, pixels, and most windows along an axis, which bounds the time for large images.
+SIDE, _MOST_WINDOWS = 32, 16
+# Centres of the rings, cycles per pixel.  The last one holds the corners too.
+RINGS: NDArray[np.float64] = np.arange(SIDE // 2 + 1) / SIDE
+# Rounds of the weighted least squares, which settle within three or four.
+_ROUNDS = 6
+# Least power of noise, squared intensity: a hundredth of the rounding of 16 bits.
+_LEAST = (0.1 / 65535) ** 2 / 12
+
+Float64Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseSpectrum:
+    """Spectrum of the noise of an image, by ``RINGS`` of frequencies."""
+
+    power: Float64Array  # (rings,): N, squared intensity
+    error: Float64Array  # (rings,): its standard error
+    relative: Float64Array  # (rings,): e, 0 to 1
+
+    def at(self, frequency: NDArray[np.floating]) -> Float64Array:
+        """N at some frequencies, cycles per pixel; beyond the last ring it stays the same."""
+        return np.interp(frequency, RINGS, self.power)
+
+    def scaled(self, factor: float) -> NoiseSpectrum:
+        """Return the spectrum of the same noise with its variance multiplied."""
+        return NoiseSpectrum(self.power * factor, self.error * factor, self.relative * factor)
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of a pixel, intensity."""
+        nu = np.fft.fftfreq(SIDE)
+        return float(np.sqrt(self.at(np.hypot(nu[:, None], nu)).mean()))
+
+
+def fit_noise_spectrum(differences: Iterable[FloatArray], scene: FloatArray) -> NoiseSpectrum:
+    """Fit N and e to differences, each (H, W), of images of one scene (H, W); see the docstring of the module."""
+    of_scene = window_powers(scene)
+    powers = [window_powers(difference) for difference in differences]
+    # The lower quartile over the differences, because some may show what the others do not.
+    found = np.array([_fit_ring(ring, m) for ring, m in zip(np.quantile(powers, 0.25, axis=0).T, of_scene.T, strict=True)])
+    # The mean of each window is taken out, which leaves half of the lowest ring.
+    found[0] = found[1]
+    return NoiseSpectrum(*np.maximum(found.T, [[_LEAST], [0], [0]]))
+
+
+def window_powers(image: FloatArray) -> Float64Array:
+    """Power spectra of windows spread evenly over an image (H, W), by ring, (windows, rings), squared intensity."""
+    side = min(SIDE, *image.shape)
+    profile = np.hanning(side + 2)[1:-1].astype(np.float32)
+    profile = np.outer(profile, profile)
+    starts = (_starts(length, side) for length in image.shape)
+    every = np.lib.stride_tricks.sliding_window_view(image, (side, side))[np.ix_(*starts)].reshape(-1, side, side)
+    tapered = (every - every.mean(axis=(1, 2), keepdims=True)) * profile
+    power = np.square(np.abs(scipy.fft.fft2(tapered))).reshape(len(tapered), -1) / np.square(profile).sum()
+    nu = np.fft.fftfreq(side)
+    ring = np.minimum(np.rint(np.hypot(nu[:, None], nu) * SIDE), SIDE // 2).astype(int).ravel()
+    present = np.unique(ring)
+    means = np.stack([power[:, ring == number].mean(axis=1) for number in present], axis=1)
+    # Small images have no frequencies in some rings.
+    return np.array([np.interp(RINGS, RINGS[present], row) for row in means])
+
+
+def _starts(length: int, side: int) -> NDArray[np.int_]:
+    """First pixels of windows that overlap by half, or that lie further apart along a long axis."""
+    count = min(_MOST_WINDOWS, 1 + round(2 * (length - side) / side))
+    return np.linspace(0, length - side, count).round().astype(int)
+
+
+def _fit_ring(difference: Float64Array, scene: Float64Array) -> tuple[float, float, float]:
+    """N, its standard error and e from the powers of a ring in every window."""
+    # Windows without detail, of which there are usually some, start the rounds.
+    noise, relative = float(np.median(difference)), 0.0
+    weights = np.ones_like(difference)
+    for _ in range(_ROUNDS):
+        weights = 1 / np.square(noise + relative * scene + _LEAST)
+        one, by_scene, by_square = weights.sum(), (weights * scene).sum(), (weights * scene**2).sum()
+        of_noise, of_both = (weights * difference).sum(), (weights * scene * difference).sum()
+        determinant = one * by_square - by_scene**2
+        noise, relative = of_noise / one, 0.0
+        if determinant > 1e-9 * one * by_square:
+            noise = (by_square * of_noise - by_scene * of_both) / determinant
+            relative = (one * of_both - by_scene * of_noise) / determinant
+        if noise < 0:
+            noise, relative = 0.0, of_both / by_square
+        elif relative < 0:
+            noise, relative = of_noise / one, 0.0
+    residual = np.sqrt(weights) * (difference - noise - relative * scene)
+    error = np.sqrt(np.square(residual).mean() / max(weights.sum(), 1e-300))
+    return float(noise), float(error), float(min(relative, 1.0))
