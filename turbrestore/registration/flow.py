@@ -16,7 +16,8 @@ surrounds them all:
    flow is that shift plus the flow to the shifted frame.
    Pixels beyond the edge of the shifted frame are filled from the reference, so that they move with the shift.  If a
    frame has a start that moves as a whole, the shift is taken from the start.
-3. The method measures the flow.
+3. The method measures the flow.  That of dense inverse search is refined by steps at full resolution
+   (:mod:`turbrestore.registration.refinement_step`), and a start is refined without a search.
 4. Where the texture of the reference does not determine the motion, the flow is drawn towards its neighbourhood
    (:mod:`turbrestore.registration.confidence`), so that flat regions move as their surroundings do.
 """
@@ -42,6 +43,7 @@ from ..runtime.threads import in_batches, map_ahead
 from .camera.global_shift import ShiftReference, frame_shift, prepare_shift_reference, shift_frame
 from .confidence import flow_confidence, noise_share, regularise_flow
 from .opencv_flow import DisParams, FarnebackParams, FlowSolver, GreyImage, dis_solver, farneback_solver
+from .refinement_step import RefineFlow, flow_refinement
 from .tvl1 import TvL1Params, tvl1_solver
 
 MIN_SIDE = 16
@@ -106,7 +108,7 @@ class FlowFrame:
     # (H, W, 2) or on a coarser grid, or None; flow to this frame from a similar reference, pixels, from which the
     # solver starts.
     start: NDArray[np.floating] | None = None
-    draft: bool = False  # whether a flow at half the resolution will do, because another will start from it
+    draft: bool = False  # whether a coarse flow will do, because another will start from it
 
 
 @dataclass(frozen=True)
@@ -213,9 +215,10 @@ def prepare_reference(
     confidence = flow_confidence(target) if params.confidence else None
     device = find_device(runtime.device) if params.method == "tvl1" else CPU
 
-    def prepared(noisy: bool) -> tuple[GreyImage, FlowSolver]:
+    def prepared(noisy: bool) -> tuple[GreyImage, FlowSolver, RefineFlow | None]:
         normalised = normalise_to_8_bits(target, *contrast, _SMOOTHING * noisy)
-        return normalised, FLOW_METHODS[params.method](params, normalised, device)
+        refine = flow_refinement(normalised) if params.method == "dis" else None
+        return normalised, FLOW_METHODS[params.method](params, normalised, device), refine
 
     solvers = {noisy: prepared(noisy) for noisy in (False, True)}
 
@@ -231,11 +234,18 @@ def prepare_reference(
         return [flow for kind, frames in alike for flow in solve_alike(*kind, list(frames))]
 
     def solve_alike(noisy: bool, draft: bool, batch: list[FlowFrame]) -> list[FloatArray]:
-        normalised, solver = solvers[noisy]
+        normalised, solver, refine = solvers[noisy]
         # Farneback's method takes no start.
         usable = [replace(frame, start=None) for frame in batch] if params.method == "farneback" else batch
         placed, starts, shifts = zip(*(_place(frame, normalised, position) for frame in usable), strict=True)
-        flows = list(solver(np.stack(placed), list(starts), draft))
+        flows = list(starts)
+        anew = [number for number, start in enumerate(starts) if start is None or refine is None]
+        if anew:
+            found = solver(np.stack([placed[number] for number in anew]), [starts[number] for number in anew], draft)
+            for number, flow in zip(anew, found, strict=True):
+                flows[number] = flow
+        if refine is not None and not draft:
+            flows = [refine(*moved) for moved in zip(placed, flows, strict=True)]
         if confidence is not None:
             flows = [regularise_flow(f, confidence, frame.noise) for f, frame in zip(flows, batch, strict=True)]
         return [flow + shift if shift.any() else flow for flow, shift in zip(flows, shifts, strict=True)]
