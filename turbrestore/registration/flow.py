@@ -49,6 +49,8 @@ from .tvl1 import TvL1Params, tvl1_solver
 MIN_SIDE = 16
 # Grey levels for each local standard deviation: ±4 deviations fit into 8 bits.
 _LEVELS_PER_DEVIATION = 32.0
+# Pixels of the grid, at least, on which averages of local contrast are computed, for each deviation of their window.
+_PIXELS_A_DEVIATION = 3
 # Most batches that are prepared for a device side by side.
 _BATCHES = 8
 # Share of the gradients of a frame above which noise makes it one that is smoothed, by so many pixels.
@@ -259,11 +261,22 @@ def normalise_contrast(image: ArrayLike, window: float, floor: float = 0.01) -> 
     """Luminance (H, W) of an image (H, W[, 3]) with zero mean and unit deviation in a Gaussian window."""
     grey = check_grey(image)
     # Centred first, because E[x²] − E[x]² loses all digits of a faint texture on a bright ground.
-    centred = grey - cv2.GaussianBlur(grey, (0, 0), window)
-    deviation = cv2.GaussianBlur(centred * centred, (0, 0), window)
+    centred = grey - _average(grey, window)
+    deviation = _average(centred * centred, window)
     deviation += np.float32(floor) ** 2
     centred /= np.sqrt(deviation, out=deviation)
     return centred
+
+
+def _average(plane: FloatArray, window: float) -> FloatArray:
+    """Average in a Gaussian window, on a grid that resolves it."""
+    height, width = plane.shape
+    step = max(int(window / _PIXELS_A_DEVIATION), 1)
+    size = -(-width // step), -(-height // step)
+    small = cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
+    sigmas = window * size[0] / width, window * size[1] / height
+    small = cv2.GaussianBlur(small, (0, 0), *sigmas, borderType=cv2.BORDER_REFLECT)
+    return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR))
 
 
 def normalise_to_8_bits(image: FloatArray, window: float, floor: float, smoothing: float = 0.0) -> NDArray[np.uint8]:
