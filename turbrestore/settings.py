@@ -177,7 +177,7 @@ class RestoreParams:
 PRESETS: Mapping[Preset, RestoreParams] = MappingProxyType(
     {
         "fast": RestoreParams(
-            flow=FlowParams(dis=DisParams(finest_scale=1, refinements=4)),
+            flow=FlowParams(dis=DisParams(finest_scale=2)),
             centroid=CentroidParams(iterations=2),
             filter=FilterParams(inner_iterations=1),
         ),

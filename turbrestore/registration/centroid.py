@@ -256,7 +256,7 @@ def centroid_steps(
 
 def _is_displaced_far(image: FloatArray, flows: FloatArray, window: float) -> bool:
     """Tell whether flows lead so far, without the motion of whole frames, that some of them may be wrong."""
-    displacement = np.sqrt(np.mean([np.var(flow, axis=(0, 1)).mean() for flow in iter_frames(flows)]))
+    displacement = np.sqrt(np.mean([np.square(cv2.meanStdDev(flow)[1]).mean() for flow in iter_frames(flows)]))
     return bool(displacement > max(_FAR, _FAR_OF_DETAIL * _detail_length(image, window)))
 
 

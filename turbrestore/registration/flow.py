@@ -16,7 +16,8 @@ surrounds them all:
    flow is that shift plus the flow to the shifted frame.
    Pixels beyond the edge of the shifted frame are filled from the reference, so that they move with the shift.  If a
    frame has a start that moves as a whole, the shift is taken from the start.
-3. The method measures the flow.
+3. The method measures the flow.  That of dense inverse search is refined by steps at full resolution
+   (:mod:`turbrestore.registration.refinement_step`), and a start is refined without a search.
 4. Where the texture of the reference does not determine the motion, the flow is drawn towards its neighbourhood
    (:mod:`turbrestore.registration.confidence`), so that flat regions move as their surroundings do.
 """
@@ -42,11 +43,14 @@ from ..runtime.threads import in_batches, map_ahead
 from .camera.global_shift import ShiftReference, frame_shift, prepare_shift_reference, shift_frame
 from .confidence import flow_confidence, noise_share, regularise_flow
 from .opencv_flow import DisParams, FarnebackParams, FlowSolver, GreyImage, dis_solver, farneback_solver
+from .refinement_step import RefineFlow, flow_refinement
 from .tvl1 import TvL1Params, tvl1_solver
 
 MIN_SIDE = 16
 # Grey levels for each local standard deviation: ±4 deviations fit into 8 bits.
 _LEVELS_PER_DEVIATION = 32.0
+# Pixels of the grid, at least, on which averages of local contrast are computed, for each deviation of their window.
+_PIXELS_A_DEVIATION = 3
 # Most batches that are prepared for a device side by side.
 _BATCHES = 8
 # Share of the gradients of a frame above which noise makes it one that is smoothed, by so many pixels.
@@ -106,7 +110,7 @@ class FlowFrame:
     # (H, W, 2) or on a coarser grid, or None; flow to this frame from a similar reference, pixels, from which the
     # solver starts.
     start: NDArray[np.floating] | None = None
-    draft: bool = False  # whether a flow at half the resolution will do, because another will start from it
+    draft: bool = False  # whether a coarse flow will do, because another will start from it
 
 
 @dataclass(frozen=True)
@@ -216,9 +220,10 @@ def prepare_reference(
     confidence = flow_confidence(target) if params.confidence else None
     device = find_device(runtime.device) if params.method == "tvl1" else CPU
 
-    def prepared(noisy: bool) -> tuple[GreyImage, FlowSolver]:
+    def prepared(noisy: bool) -> tuple[GreyImage, FlowSolver, RefineFlow | None]:
         normalised = normalise_to_8_bits(target, *contrast, _SMOOTHING * noisy)
-        return normalised, FLOW_METHODS[params.method](params, normalised, device)
+        refine = flow_refinement(normalised) if params.method == "dis" else None
+        return normalised, FLOW_METHODS[params.method](params, normalised, device), refine
 
     solvers = {noisy: prepared(noisy) for noisy in (False, True)}
 
@@ -234,11 +239,18 @@ def prepare_reference(
         return [flow for kind, frames in alike for flow in solve_alike(*kind, list(frames))]
 
     def solve_alike(noisy: bool, draft: bool, batch: list[FlowFrame]) -> list[FloatArray]:
-        normalised, solver = solvers[noisy]
+        normalised, solver, refine = solvers[noisy]
         # Farneback's method takes no start.
         usable = [replace(frame, start=None) for frame in batch] if params.method == "farneback" else batch
         placed, starts, shifts = zip(*(_place(frame, normalised, position) for frame in usable), strict=True)
-        flows = list(solver(np.stack(placed), list(starts), draft))
+        flows = list(starts)
+        anew = [number for number, start in enumerate(starts) if start is None or refine is None]
+        if anew:
+            found = solver(np.stack([placed[number] for number in anew]), [starts[number] for number in anew], draft)
+            for number, flow in zip(anew, found, strict=True):
+                flows[number] = flow
+        if refine is not None and not draft:
+            flows = [refine(*moved) for moved in zip(placed, flows, strict=True)]
         if confidence is not None:
             flows = [regularise_flow(f, confidence, max(frame.noise, least_noise)) for f, frame in zip(flows, batch, strict=True)]
         return [flow + shift if shift.any() else flow for flow, shift in zip(flows, shifts, strict=True)]
@@ -252,11 +264,22 @@ def normalise_contrast(image: ArrayLike, window: float, floor: float = 0.01) -> 
     """Luminance (H, W) of an image (H, W[, 3]) with zero mean and unit deviation in a Gaussian window."""
     grey = check_grey(image)
     # Centred first, because E[x²] − E[x]² loses all digits of a faint texture on a bright ground.
-    centred = grey - cv2.GaussianBlur(grey, (0, 0), window)
-    deviation = cv2.GaussianBlur(centred * centred, (0, 0), window)
+    centred = grey - _average(grey, window)
+    deviation = _average(centred * centred, window)
     deviation += np.float32(floor) ** 2
     centred /= np.sqrt(deviation, out=deviation)
     return centred
+
+
+def _average(plane: FloatArray, window: float) -> FloatArray:
+    """Average in a Gaussian window, on a grid that resolves it."""
+    height, width = plane.shape
+    step = max(int(window / _PIXELS_A_DEVIATION), 1)
+    size = -(-width // step), -(-height // step)
+    small = cv2.resize(plane, size, interpolation=cv2.INTER_AREA)
+    sigmas = window * size[0] / width, window * size[1] / height
+    small = cv2.GaussianBlur(small, (0, 0), *sigmas, borderType=cv2.BORDER_REFLECT)
+    return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR))
 
 
 def normalise_to_8_bits(image: FloatArray, window: float, floor: float, smoothing: float = 0.0) -> NDArray[np.uint8]:

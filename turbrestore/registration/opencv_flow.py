@@ -1,10 +1,9 @@
 """The two flow methods that come from OpenCV: dense inverse search and Farneback's polynomial expansion.
 
 Dense inverse search with variational refinement (Kroeger et al. 2016) is the default method of
-:mod:`turbrestore.registration.flow`.  A flow that starts from an earlier one skips the coarse levels of the pyramid,
-which only serve to find a start, and three quarters of the refinements, because the start is smooth already, and puts
-patches further apart: a third of the time.  A draft, which a flow of the same frame will start from, ends at half the
-resolution: a fifth of the time.  Farneback's method (2003) takes no start and makes no drafts.
+:mod:`turbrestore.registration.flow`.  It ends at half the resolution, where it takes a fifth of the time, because
+displacements of air are smooth over ten pixels; steps at full resolution
+(:mod:`turbrestore.registration.refinement_step`) find what is left.  Farneback's method (2003) takes no start.
 """
 
 from __future__ import annotations
@@ -23,8 +22,10 @@ GreyImage = NDArray[np.uint8]
 # Takes frames (B, H, W), the flow that each starts from, or None, and whether drafts will do; returns flows
 # (B, H, W, 2).  Threads share a solver.
 FlowSolver = Callable[[GreyImage, list[FloatArray | None], bool], FloatArray]
-# Pixels by which the patches of a flow with a start lie further apart.
-_WIDER_STRIDE = 2
+# Lines above which the flow of air is smooth over so many pixels that a quarter of the resolution will do.
+_LARGE = 1000
+# Level, above the finest, at which a search that has a start begins.
+_LEVELS_FROM_START = 1
 
 
 @dataclass(frozen=True)
@@ -33,27 +34,28 @@ class DisParams:
 
     Parameters
     ----------
-    finest_scale : int
-        Pyramid level at which the search ends; 0 is full resolution, 1 is about five times faster.
+    finest_scale : int, optional
+        Pyramid level at which the search ends: 0 is full resolution, 1 half of it, and so on.  By default 1, and 2 for
+        frames of more than 1,000 lines.
     patch_size : int
-        Side of the matched patches, pixels.
+        Side of the matched patches, pixels of that level.
     patch_stride : int
-        Distance between patches, pixels; two more where a flow starts from an earlier one.
+        Distance between patches, pixels of that level.
     refinements : int
-        Iterations of the variational refinement; half of them for a draft, and a quarter where a flow starts from an
-        earlier one.
+        Iterations of the variational refinement.
     smoothness : float
         Weight of the smoothness term in the refinement.
     """
 
-    finest_scale: int = 0
+    finest_scale: int | None = None
     patch_size: int = 8
     patch_stride: int = 3
-    refinements: int = 8
+    refinements: int = 4
     smoothness: float = 6.0
 
     def __post_init__(self) -> None:
-        require(0 <= self.finest_scale <= 4, f"finest_scale: expected 0 to 4, found {self.finest_scale}")
+        if self.finest_scale is not None:
+            require(0 <= self.finest_scale <= 4, f"finest_scale: expected 0 to 4, found {self.finest_scale}")
         require(4 <= self.patch_size <= 32, f"patch_size: expected 4 to 32 pixels, found {self.patch_size}")
         require(
             1 <= self.patch_stride <= self.patch_size,
@@ -91,35 +93,26 @@ class FarnebackParams:
         require(self.neighbourhood in (5, 7), f"neighbourhood: expected 5 or 7 pixels, found {self.neighbourhood}")
 
 
-def dis_solver(params: DisParams, reference: GreyImage, start_level: int | None = None) -> FlowSolver:
-    """Prepare dense inverse search from a reference.
+def dis_solver(params: DisParams, reference: GreyImage) -> FlowSolver:
+    """Prepare dense inverse search from a reference (H, W); a start is a guess, near which the search begins."""
+    finest = params.finest_scale
+    if finest is None:
+        finest = 1 if min(reference.shape) <= _LARGE else 2
 
-    With ``start_level`` a start is only a guess: the search begins that many levels above the finest, and is as
-    thorough as without a start.  ``reference`` (H, W).
-    """
-
-    def solve(frame: GreyImage, start: FloatArray | None, draft: bool) -> FloatArray:
+    def solve(frame: GreyImage, start: FloatArray | None) -> FloatArray:
         # A solver object keeps buffers that threads must not share; making one is cheap beside a flow.
         solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        finest, stride, refinements = params.finest_scale + draft, params.patch_stride, params.refinements
-        if draft:
-            refinements -= refinements // 2
-        if start is not None and start_level is not None:
-            refinements -= refinements // 2
-            solver.setCoarsestScale(finest + start_level)
-        elif start is not None:
-            refinements = -(-refinements // 4)
-            stride = min(stride + _WIDER_STRIDE, params.patch_size)
-            solver.setCoarsestScale(finest)
+        if start is not None:
+            solver.setCoarsestScale(finest + _LEVELS_FROM_START)
         solver.setFinestScale(finest)
         solver.setPatchSize(params.patch_size)
-        solver.setPatchStride(stride)
-        solver.setVariationalRefinementIterations(refinements)
+        solver.setPatchStride(params.patch_stride)
+        solver.setVariationalRefinementIterations(params.refinements)
         solver.setVariationalRefinementAlpha(params.smoothness)
         return solver.calc(reference, frame, start)
 
-    return lambda frames, starts, draft: np.stack(
-        [solve(frame, start, draft) for frame, start in zip(frames, starts, strict=True)]
+    return lambda frames, starts, _: np.stack(
+        [solve(frame, start) for frame, start in zip(frames, starts, strict=True)]
     )
 
 

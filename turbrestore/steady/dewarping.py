@@ -53,9 +53,7 @@ from .settings import SteadyParams
 from .windows import Window, WindowFrame, light_between, normalised_image, relit
 
 # Patches this sparse lose nothing on phase screens; closer ones take a fifth longer.
-_FLOW = DisParams(finest_scale=0, patch_size=8, patch_stride=4, refinements=5, smoothness=10.0)
-# Level of the pyramid, above the finest, at which a search with a start begins.
-_START_LEVEL = 1
+_FLOW = DisParams(finest_scale=0, patch_size=8, patch_stride=4, refinements=3, smoothness=10.0)
 # Change of the light in a window, logarithm, of which half is taken out: cameras hunt by less, and lamps change more.
 _HUNTING = 0.25
 
@@ -145,7 +143,7 @@ def measure_flow(reference: FloatArray, image: FloatArray, start: FloatArray) ->
 
 
 def _solver(normalised: GreyImage, shape: tuple[int, ...]) -> Callable[[GreyImage, FloatArray], FloatArray]:
-    solve, pixel = dis_solver(_FLOW, normalised, _START_LEVEL), np.float32(pixel_of(shape))
+    solve, pixel = dis_solver(_FLOW, normalised), np.float32(pixel_of(shape))
     return lambda other, start: pixel * solve(other[None], [start / pixel], False)[0]
 
 

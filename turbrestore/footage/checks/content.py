@@ -18,6 +18,7 @@ The modules scene_cuts, stuck_pixels, repeats, black_borders and missing_pixels 
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from array import array
 from dataclasses import dataclass
@@ -240,8 +241,8 @@ class _ContentScan:
         self._borders = BlackBorderDetector()
         self._stuck = StuckPixelDetector(params.stuck_excess)
         self._scenes = SceneDetector(params.cut_similarity)
-        # The same for a clip with black borders, whose thumbnails are compared without them.
-        self._bordered_scenes = SceneDetector(params.cut_similarity)
+        # The same for a clip with black borders, whose thumbnails are compared without them, from the first one on.
+        self._bordered_scenes: SceneDetector | None = None
         self._shown: FloatArray | None = None
 
     def update(self, number: int, pixels: PixelArray, mosaic: PixelArray | None) -> None:
@@ -256,6 +257,8 @@ class _ContentScan:
         if mosaic is None:
             border = self._borders.update(pixels)
             if border.any():
+                if self._bordered_scenes is None:
+                    self._bordered_scenes = copy.deepcopy(self._scenes)
                 shown = _without_border(thumb, border, np.zeros_like(thumb) if self._shown is None else self._shown)
             self._shown = shown
         contrast = float(thumb.std())
@@ -266,10 +269,12 @@ class _ContentScan:
             # Stuck pixels are isolated in the mosaic; interpolation of colours spreads them.
             self._stuck.update(values if mosaic is None else self._planes(mosaic))
             self._scenes.update(thumb)
-            self._bordered_scenes.update(shown)
+            if self._bordered_scenes is not None:
+                self._bordered_scenes.update(shown)
         else:
             self._scenes.skip()
-            self._bordered_scenes.skip()
+            if self._bordered_scenes is not None:
+                self._bordered_scenes.skip()
 
     def report(self) -> ContentReport:
         numbers = np.asarray(self._source.numbers)
@@ -277,7 +282,7 @@ class _ContentScan:
         blank = _are_blank(contrasts, self._params.blank_contrast)
         duplicated = np.isin(numbers, self._duplicated) | self._repeats.found()
         borders = self._borders.found()
-        labels = np.where(blank, -1, (self._bordered_scenes if borders else self._scenes).labels())
+        labels = np.where(blank, -1, ((borders and self._bordered_scenes) or self._scenes).labels())
         scenes, used = group_scenes(numbers, labels)
         left_out = blank | ~used
         # In a video of one repeated frame there are no others to use.

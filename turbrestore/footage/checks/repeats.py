@@ -21,7 +21,7 @@ from ...core.arrays import FloatArray, luminance
 from ...core.noise import estimate_noise
 
 # Pixels of a frame that are compared, about, and the share of them that counts as edges.
-_PIXELS, _EDGES = 1 << 18, 0.1
+_PIXELS, _EDGES = 1 << 15, 0.1
 _PERCENTILE, _DEVIATIONS = 80, 1.2816
 # Largest d of a repeat: in units of σ, relative to the contrast of the frame, and relative to the usual d.
 _OF_NOISE, _OF_CONTRAST, _OF_USUAL = 0.7, 0.03, 1 / 3

@@ -45,7 +45,7 @@ _LEAST_OVERLAP = 0.1
 DEAD_ZONE = 2.0
 # A flow moves as a whole if this share of it lies within the dead zone around its median; both are computed from at
 # most so many rows and columns.
-_SHARE_OF_WHOLE, _SAMPLE = 0.75, 64
+_SHARE_OF_WHOLE, _SAMPLE = 0.75, 32
 
 Shift = NDArray[np.float64]
 Slices = tuple[slice, slice]
