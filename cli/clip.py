@@ -18,14 +18,11 @@ from turbrestore.io.source import FrameSource
 from turbrestore.memory_plan import training_share
 from turbrestore.metrics import comparable
 from turbrestore.pipeline import restore as run_pipeline
-from turbrestore.report import check_report, write_report
 from turbrestore.results import Restoration
-from turbrestore.runs.run_record import describe_run
 from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.settings import Preset, RestoreParams
 from turbrestore.stacking.placement import settings_of_known_flows
 
-from .cluster import connected, over_workers
 from .inputs import files_read, open_input, read_input_image
 from .kept import check_room, kept_stages, own_outputs
 from .options import Machine, Selection
@@ -119,7 +116,11 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
             order.params, order.selection, order.bit_depth, order.machine, order.memory_limit, order.preset, order.tile
         )
         command = repeating_command(order.input, order.output, record)
-        run = describe_run(source, record, command) if order.keep or order.report else None
+        run = None
+        if order.keep or order.report:
+            from turbrestore.runs.run_record import describe_run
+
+            run = describe_run(source, record, command)
         depth = source.bit_depth if order.bit_depth is None else order.bit_depth
         if stages is not None and run is not None:
             save_stages(stages, restoration, run, depth)
@@ -129,6 +130,8 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
         if order.uncertainty is not None and restoration.uncertainty is not None:
             write_map(order.uncertainty, restoration.uncertainty, may_replace(order.uncertainty))
         if order.report is not None and run is not None:
+            from turbrestore.report import write_report
+
             write_report(order.report, restoration, run, overwrite=may_replace(order.report))
         if stages is not None:
             stages.announce_outputs()
@@ -159,6 +162,8 @@ def _tile_workers(order: Order, source: FrameSource) -> Iterator[TileMap | None]
         )
         yield None
     else:
+        from .cluster import connected, over_workers
+
         with connected(order.scheduler, order.workers or 1, order.quiet) as client:
             yield over_workers(client)
 
@@ -187,6 +192,8 @@ def _check_outputs(order: Order) -> Callable[[Path], bool]:
         )
         check_output(order.uncertainty, inputs, may_replace(order.uncertainty), (".tif", ".tiff"))
     if order.report is not None:
+        from turbrestore.report import check_report
+
         check_report(order.report, inputs, may_replace(order.report))
     check_keep(order.keep, [*inputs, *order.outputs], order.overwrite, order.resume)
     return may_replace

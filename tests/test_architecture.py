@@ -112,14 +112,18 @@ LIBRARIES = {
     "uvicorn",
 }
 # What takes longest to import of the libraries that a command needs.
-SLOW = {"scipy.stats", "scipy.ndimage"}
+SLOW = {"scipy.fft", "scipy.linalg", "scipy.ndimage", "scipy.optimize", "scipy.sparse", "scipy.special", "scipy.stats"}
+PARSER = {"cyclopts", "rich"}
+# What a restoration takes only where an option asks for it.
+ON_DEMAND = LIBRARIES - {"cv2", "numba", "scipy"} | {"rich", "skimage", "PIL", "imageio", "tifffile", "rawpy", "jinja2"}
+ON_DEMAND |= {"turbrestore.report", "turbrestore.runs.run_record", "importlib.metadata"}
 
 
 @pytest.mark.parametrize(
     ("action", "absent"),
     [
         ("import turbrestore", LIBRARIES | {"numpy"}),
-        ("import turbrestore_cli.__main__ as m; m.main(['--help'])", LIBRARIES),
+        ("import turbrestore_cli.__main__ as m; m.main(['--help'])", LIBRARIES | PARSER),
         ("import turbrestore_cli.__main__ as m; m.main(['restore', '--help'])", LIBRARIES - {"cv2", "scipy"} | SLOW),
         ("import turbrestore_cli.__main__ as m; m.main(['app', '--help'])", LIBRARIES),
     ],
