@@ -35,10 +35,7 @@ from .output import (
     write_result,
     write_settings,
 )
-from .progress import progress_bars, say
-
-# Iterations that a centroid usually takes, and flows that are measured in the time of a deconvolution.
-_ITERATIONS, _FLOWS_A_DECONVOLUTION = 2, 60
+from .progress import USUAL_ITERATIONS, USUAL_PASSES, expected_times, progress_bars, say
 
 
 @dataclass(frozen=True)
@@ -108,7 +105,7 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
     with kept_stages(order.keep, source, params, runtime, order.resume, order.checkpoint_every, order.quiet) as stages:
         with (
             _tile_workers(order, source) as map_tiles,
-            progress_bars(order.quiet, _expected_times(source, params)) as progress,
+            progress_bars(order.quiet, *_expected_times(source, params, order.preset)) as progress,
         ):
             tell_decision = _say_decision if order.verbose else None
             restoration = run_pipeline(source, params, runtime, stages, progress, tell_decision, map_tiles)
@@ -142,12 +139,18 @@ def _say_decision(decision: Decision) -> None:
     say(str(decision), quiet=False)
 
 
-def _expected_times(source: FrameSource, params: RestoreParams) -> dict[str, float]:
-    """Expect times of the stages, in flows: those that they measure, and what deconvolution takes."""
+def _expected_times(
+    source: FrameSource, params: RestoreParams, preset: Preset
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Expect times of the stages that a run has, and the share of its steps that a stage takes."""
     train = training_share(len(source), source.shape[1:], params.train, params.filter.training == "skip")
-    filtered = max(len(source) * params.filter.inner_iterations - train, 1)
-    times = {"centroid": _ITERATIONS * train, "filter": filtered, "deconvolve": _FLOWS_A_DECONVOLUTION}
-    return {stage: float(time) for stage, time in times.items() if params.runs(stage)}
+    found = {"read": True, "witnesses": params.finds_blur, "width": params.finds_blur}
+    times = {
+        stage: time
+        for stage, time in expected_times(preset, len(source), train).items()
+        if (found[stage] if stage in found else params.runs(stage))
+    }
+    return times, {"centroid": min(USUAL_PASSES / params.centroid.iterations, 1.0), "deconvolve": USUAL_ITERATIONS}
 
 
 @contextmanager
