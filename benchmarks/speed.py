@@ -110,7 +110,10 @@ class Clip:
 def run_timed(code: str, words: list[str], tree: Path | None = None) -> tuple[float, float]:
     """Run Python code in a process: seconds of the clock and of the processor."""
     before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    subprocess.run([sys.executable, "-c", code, *words], stdout=subprocess.DEVNULL, check=True, env=environment(tree))
+    command = [sys.executable, "-c", code, *words]
+    # Packages of the working folder would come first.
+    folder = tempfile.gettempdir()
+    subprocess.run(command, stdout=subprocess.DEVNULL, check=True, cwd=folder, env=environment(tree))
     seconds, after = time.perf_counter() - begun, resource.getrusage(resource.RUSAGE_CHILDREN)
     return seconds, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
