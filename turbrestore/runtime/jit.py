@@ -49,8 +49,8 @@ class Jit(Generic[*Arguments]):
         if len(known) < len(kinds) or not keepable():
             return self._numba
         kept = Kept(self.py_func, sorted(_OPTIONS), known)
-        code = kept.read()
         try:
+            code = kept.read()
             if code is None:
                 code = translate(_intermediate_code(self.py_func, known), known)
                 kept.write(code)

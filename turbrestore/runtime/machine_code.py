@@ -177,11 +177,13 @@ class Kept:
         import llvmlite.binding as llvm
 
         code, source = function.__code__, Path(function.__code__.co_filename)
-        constants = [(name, repr(function.__globals__.get(name))) for name in code.co_names]
+        used = [(name, function.__globals__.get(name)) for name in code.co_names]
+        # Numba takes them as they are when it compiles; what else a loop uses is part of NumPy.
+        constants = [(name, repr(value)) for name, value in used if isinstance(value, int | float | np.number | tuple)]
         machine = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
         made_for = repr((llvmlite.__version__, machine, *kinds)).encode()
         self.name = f"{source.stem}.{code.co_name}-{hashlib.sha256(made_for).hexdigest()[:16]}"
-        made_of = repr((code.co_code, code.co_consts, code.co_varnames, constants, options)).encode()
+        made_of = repr((code.co_code, code.co_consts, constants, options, _entry("loop", kinds))).encode()
         self._source, self._digest = source, hashlib.sha256(made_of + made_for).digest()
 
     def read(self) -> bytes | None:
@@ -201,10 +203,15 @@ class Kept:
         for path in self._places():
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-                    file.write(self._digest + hashlib.sha256(code).digest() + code)
-                Path(file.name).replace(path)
+                number, begun = tempfile.mkstemp(dir=path.parent)
             except OSError:
+                continue
+            try:
+                with os.fdopen(number, "wb") as file:
+                    file.write(self._digest + hashlib.sha256(code).digest() + code)
+                Path(begun).replace(path)
+            except OSError:
+                Path(begun).unlink(missing_ok=True)
                 continue
             return
 
@@ -214,5 +221,5 @@ class Kept:
             return []
         chosen = os.environ.get("NUMBA_CACHE_DIR")
         beside = Path(importlib.util.cache_from_source(str(self._source))).parent
-        user = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "turbrestore"
+        user = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "turbrestore"
         return [folder / f"{self.name}.o" for folder in ((Path(chosen),) if chosen else (beside, user))]
