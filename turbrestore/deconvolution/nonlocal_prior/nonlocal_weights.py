@@ -198,8 +198,7 @@ def search_patches(grey: FloatArray, params: NonlocalParams, threads: int = 0) -
         block = np.ascontiguousarray(padded[top : top + rows + 2 * margin, left : left + columns + 2 * margin])
         found = np.full((rows, places, columns), _NO_KEY, np.int32)
         edges = np.array([-top, height - top, -left, width - left])
-        scratch = np.empty(columns + window.size - 1, np.float32), np.empty((2, columns), np.float32)
-        search_tile(block, window, offsets, edges, params.nearest, params.rank_mask, *scratch, found)
+        search_tile(block, window, offsets, edges, params.nearest, params.rank_mask, found)
         keys[top : top + rows, left : left + columns] = found[:, : keys.shape[2]].transpose(0, 2, 1)
 
     corners = ((top, left) for top in range(0, height, _TILE_ROWS) for left in range(0, width, _TILE_COLUMNS))
@@ -216,21 +215,19 @@ def search_tile(
     edges: NDArray[np.int64],
     nearest: int,
     rank_mask: int,
-    down: FloatArray,
-    along: FloatArray,
     found: Keys,
 ) -> None:
     """Choose neighbours of every pixel of a tile.
 
     Two distances at a time pass the sorted keys of the best and change places with those that they are less than. There
     is no branch in that, so that the compiler works on many pixels at once.
-    ``block`` (rows + 2 margin, columns + 2 margin); ``window`` (patch,); ``offsets`` (n, 2); ``edges`` (4,);
-    ``found`` (rows, nearest + best or more, columns); ``down`` (columns + patch - 1,) and ``along`` (2, columns) are
-    overwritten.
+    ``block`` (rows + 2 margin, columns + 2 margin); ``window`` (patch,); ``offsets`` (n, 2); ``edges`` (4,); ``found``
+    (rows, nearest + best or more, columns).
     """
     rows, places, columns = found.shape
     patch, nothing, far = window.size, np.float32(0), np.float32(np.inf)
     margin = (block.shape[1] - columns) // 2 - patch // 2
+    down, along = np.empty(columns + patch - 1, np.float32), np.empty((2, columns), np.float32)
     keys = along.view(np.int32)
     for row in range(rows):
         best = found[row]
