@@ -21,8 +21,6 @@ import turbrestore as tr
 
 # Frames and side of what is restored first, so that all that is loaded, compiled and started once has been.
 WARM_FRAMES, WARM_SIDE = 24, 64
-# Frames by which flow alone is measured.
-FLOW_FRAMES = 12
 
 
 def run(task: dict[str, Any]) -> dict[str, Any]:
@@ -30,7 +28,7 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
 
     The task names a file of 8-bit or float ``frames`` (.npy), and may ask for the ``count`` of frames, which are
     repeated in order, a ``preset``, ``threads``, frames to ``train`` and ``passes`` of the centroid, for a file of
-    ``images`` (.npz) to write, for the processor time of ``flow`` alone, or for a ``steady`` video.
+    ``images`` (.npz) to write, or for a ``steady`` video.
     """
     stored = np.load(task["frames"])
     source = repeated(stored, task.get("count", len(stored)))
@@ -38,7 +36,7 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
     if "passes" in task:
         params = replace(params, centroid=tr.CentroidParams(iterations=task["passes"]))
     small = stored[:WARM_FRAMES, :WARM_SIDE, :WARM_SIDE]
-    stages: dict[str, float] = {}
+    stages, train = dict[str, float](), 0
     if task.get("steady"):
         deque(tr.steady_frames(small / np.float32(255), runtime=runtime), 0)
         begun, worked = time.perf_counter(), time.process_time()
@@ -48,24 +46,11 @@ def run(task: dict[str, Any]) -> dict[str, Any]:
         params = replace(params, train=task.get("train"))
         begun, worked = time.perf_counter(), time.process_time()
         restoration = tr.restore(source, params, runtime)
-        stages = dict(restoration.seconds)
+        stages, train = dict(restoration.seconds), restoration.train
         if "images" in task:
             np.savez(Path(task["images"]), filtered=restoration.filtered.image, result=restoration.image)
     seconds, cpu = time.perf_counter() - begun, time.process_time() - worked
-    figures: dict[str, Any] = {"seconds": seconds, "cpu": cpu, "stages": stages}
-    if task.get("flow"):
-        figures["flow"] = flow_alone(stored, runtime) * len(source)
-    return figures
-
-
-def flow_alone(stored: np.ndarray, runtime: tr.Runtime) -> float:
-    """Processor time of one bare call of dense inverse search for each frame, at full resolution, s a frame."""
-    frames = stored[:FLOW_FRAMES].astype(np.float32) / 255
-    bare = tr.FlowParams(contrast_window=0, global_shift=False, confidence=False)
-    tr.estimate_flow(frames[0], frames[:2], bare, runtime)
-    worked = time.process_time()
-    tr.estimate_flow(frames.mean(axis=0), frames, bare, runtime)
-    return (time.process_time() - worked) / len(frames)
+    return {"seconds": seconds, "cpu": cpu, "stages": stages, "train": train}
 
 
 def repeated(stored: np.ndarray, count: int) -> Any:

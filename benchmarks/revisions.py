@@ -25,12 +25,12 @@ Figures = dict[str, Any]
 
 @contextmanager
 def revision(name: str | None) -> Iterator[Path | None]:
-    """Lay out the package of a revision in a folder that goes away afterwards; None for no name."""
+    """Lay out the packages of a revision in a folder that goes away afterwards; None for no name."""
     if name is None:
         yield None
         return
     root = Path(__file__).resolve().parent.parent
-    command = ["git", "archive", "--format=tar", name, "turbrestore"]
+    command = ["git", "archive", "--format=tar", name, "turbrestore", "cli"]
     packed = subprocess.run(command, cwd=root, capture_output=True, check=False)
     if packed.returncode:
         said = packed.stderr.decode().strip().splitlines()[-1:]
@@ -38,16 +38,24 @@ def revision(name: str | None) -> Iterator[Path | None]:
     with tempfile.TemporaryDirectory() as folder:
         with tarfile.open(fileobj=io.BytesIO(packed.stdout)) as archive:
             archive.extractall(folder, filter="data")
+        # The name under which it is installed.
+        (Path(folder) / "cli").rename(Path(folder) / "turbrestore_cli")
         yield Path(folder)
+
+
+def environment(tree: Path | None) -> dict[str, str]:
+    """Environment of a process that has the packages in a folder, or the present ones."""
+    paths = [str(tree)] if tree else []
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([*paths, os.environ.get("PYTHONPATH", "")]).strip(":")}
 
 
 def child(script: str, task: Figures, tree: Path | None = None) -> Figures:
     """Measure a task by a script, with the package in a folder or with the present one."""
-    paths = [str(tree)] if tree else []
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([*paths, os.environ.get("PYTHONPATH", "")]).strip(":")}
     command = [sys.executable, script, "--child", json.dumps(task)]
     with tempfile.TemporaryDirectory() as folder:
-        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False, cwd=folder, env=environment)
+        done = subprocess.run(
+            command, stdout=subprocess.PIPE, text=True, check=False, cwd=folder, env=environment(tree)
+        )
     if done.returncode:
         raise TurbrestoreError(f"{Path(script).name}: expected figures of {task}, found exit status {done.returncode}")
     figures: Figures = json.loads(done.stdout)

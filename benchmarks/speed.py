@@ -1,35 +1,40 @@
-"""Time of whole restorations beside an earlier revision and beside optical flow alone, and how it grows.
+"""Time of the command that restores a clip beside an earlier revision, its start alone, and how it grows.
 
     python benchmarks/speed.py --before 546a653 --full --write benchmarks/results/speed.md
+    python benchmarks/speed.py --stages
 
-prints a Markdown document, writes it, and exits with 1 when a bound is broken.  Time is processor time, which other
-programs on the machine change little.  Each figure comes from a process of its own, the revisions in turn, and ratios
-are medians of those of neighbouring runs.  ``--before`` names a revision of this repository; without it only the
-present tree is measured.  ``--full`` adds larger clips, frames of 1920×1080 and 3840×2160, and more runs.
+prints a Markdown document, writes it, and exits with 1 when a bound is broken.  Other programs on the machine change
+the time of the processor little, that of the clock much.  Each figure comes from a process of its own, the revisions in
+turn, and ratios are medians of those of neighbouring runs.  ``--before`` names a revision of this repository; without
+it only the present tree is measured.  ``--full`` adds larger clips, frames of 1920×1080 and 3840×2160, and more runs.
+``--stages`` prints what every stage takes, which ``cli/progress.py`` has.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import resource
 import subprocess
 import sys
 import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import batch
 import numpy as np
 from provenance import publish
-from revisions import Figures, child, revision, take_two_cores
+from revisions import Figures, child, environment, revision, take_two_cores
 
 from turbrestore.core.errors import TurbrestoreError
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
 CHILD = str(Path(__file__).with_name("restore_child.py"))
-# Against the standard preset of an earlier revision; the exponents; and help against an import of NumPy.
-WHOLE_BOUND, FRAMES_BOUND, PIXELS_BOUND, HELP_BOUND = 1.15, 1.05, 1.1, 6.0
+# Processor time against the standard preset of an earlier revision; the exponents; and the list of commands and the
+# start of a restoration against an import of NumPy.
+WHOLE_BOUND, FRAMES_BOUND, PIXELS_BOUND, HELP_BOUND, START_BOUND = 1.15, 1.05, 1.1, 1.0, 6.0
 # What the exponents are fitted to: two passes of the centroid, and at most so many frames to train.
 COUNTS, COUNTS_SIDE, TRAINED = (12, 120, 500, 2000), 128, 60
 SIZES, FULL_SIZES, SIZES_COUNT = ((128, 128), (256, 256), (512, 512)), ((1080, 1920), (2160, 3840)), 12
@@ -38,8 +43,19 @@ FEWEST_FITTED, LEAST_PIXELS = 120, 256**2
 BATCH = (6, 48, 128)
 # Distinct frames of a clip; longer ones repeat them.
 DISTINCT = 60
-STAGES = ("centroid", "filter", "deconvolve")
 HELP = ("--help", "restore --help")
+# A command that leaves the names of the modules that it has loaded, and what loads them.
+COMMAND = """import sys
+from turbrestore_cli.__main__ import main
+code = main(sys.argv[2:])
+open(sys.argv[1], "w").write(" ".join(sys.modules))
+sys.exit(code)"""
+START = """import contextlib, importlib, sys
+for name in open(sys.argv[1]).read().split():
+    with contextlib.suppress(Exception):
+        importlib.import_module(name)"""
+# Stages of the clip by which ``--stages`` measures, with what they grow with.
+STAGES_CLIP, STAGES_PRESETS = (60, 256, 256, "camera"), ("standard", "fast", "paper")
 
 
 @dataclass(frozen=True)
@@ -69,11 +85,41 @@ class Clip:
             np.save(path, np.stack([np.rint(frame * 255).clip(0, 255).astype(np.uint8) for frame in moved]))
         return path
 
+    def write_whole(self, folder: Path) -> Path:
+        """Write all frames, which repeat the distinct ones, as a .npy file."""
+        distinct, path = np.load(self.write(folder)), folder / f"whole_{self.scene}_{self.count}_{self.height}.npy"
+        if not path.exists():
+            np.save(path, distinct[np.arange(self.count) % len(distinct)])
+        return path
+
+    def command(self, folder: Path, preset: str = "standard", tree: Path | None = None) -> Figures:
+        """Run ``turbrestore restore`` on the clip: its time, and the processor time of loading what it loads."""
+        modules, result = folder / "modules.txt", folder / "result.png"
+        words = ["restore", str(self.write_whole(folder)), str(result), "--preset", preset, "--overwrite", "--quiet"]
+        seconds, cpu = run_timed(COMMAND, [str(modules), *words], tree)
+        _, start = run_timed(START, [str(modules)], tree)
+        figures = {"seconds": seconds, "cpu": cpu, "start": start, "modules": len(modules.read_text().split())}
+        print(f"{'before' if tree else 'now'}: {self}, {preset}: {json.dumps(figures)}", file=sys.stderr, flush=True)
+        return figures
+
     def measure(self, folder: Path, tree: Path | None = None, **task: object) -> Figures:
         """Restore the clip in a process of its own."""
         return child(CHILD, {"frames": str(self.write(folder)), "count": self.count, **task}, tree)
 
 
+def run_timed(code: str, words: list[str], tree: Path | None = None) -> tuple[float, float]:
+    """Run Python code in a process: seconds of the clock and of the processor."""
+    before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    command = [sys.executable, "-c", code, *words]
+    # Packages of the working folder would come first.
+    folder = tempfile.gettempdir()
+    subprocess.run(command, stdout=subprocess.DEVNULL, check=True, cwd=folder, env=environment(tree))
+    seconds, after = time.perf_counter() - begun, resource.getrusage(resource.RUSAGE_CHILDREN)
+    return seconds, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+# Run first, so that all that is compiled once has been.
+WARM = Clip(24, 64, 64)
 ROWS = (Clip(50, 128, 128), Clip(120, 256, 256, runs=3))
 FULL_ROWS = (
     Clip(50, 128, 128),
@@ -91,8 +137,13 @@ def main() -> int:
     parser.add_argument("--full", action="store_true", help="larger clips, and more runs")
     parser.add_argument("--before", metavar="REVISION", help="measure this revision beside the present tree")
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the document")
+    parser.add_argument("--stages", action="store_true", help="print what every stage takes, and nothing else")
     options = parser.parse_args()
     take_two_cores()
+    if options.stages:
+        with tempfile.TemporaryDirectory() as folder:
+            print(stage_costs(Path(folder)))
+        return 0
     try:
         with revision(options.before) as tree, tempfile.TemporaryDirectory() as folder:
             text, broken = document(options.full, options.before, tree, Path(folder))
@@ -109,18 +160,18 @@ def document(full: bool, before: str | None, tree: Path | None, folder: Path) ->
     """Markdown of the tables, and the bounds that are broken."""
     broken: list[str] = []
     command = f"python benchmarks/speed.py{' --full' if full else ''}{f' --before {before}' if before else ''}"
-    beside = f"; *before* is the preset `standard` of revision {before}" if before else ""
+    beside = f"  *Before* is the preset `standard` of revision {before}." if before else ""
     lines = [
         "# Speed\n",
-        f"What `{command} --write benchmarks/results/speed.md` measures: processor time, s, of clips in memory under "
-        "smooth random motion, on two cores.  It ends with 1 where a bound is broken.\n",
-        "## Restorations\n",
-        "Whole restorations, medians of the runs; *flow alone* is one bare call of dense inverse search for each frame "
-        f"at full resolution, without which nothing can be done{beside}.\n",
+        f"What `{command} --write benchmarks/results/speed.md` measures, on two cores, with clips under smooth random "
+        "motion.  It ends with 1 where a bound is broken.\n",
+        "## Commands\n",
+        "`turbrestore restore CLIP IMAGE`, from its start to its end, medians of the runs: seconds of the clock and of "
+        f"the processor.  *Start* is the processor time of loading all that it loads, and nothing else.{beside}\n",
         *_restorations(FULL_ROWS if full else ROWS, tree, folder, broken),
         "\n## Growth\n",
-        f"Restorations with two passes of the centroid and at most {TRAINED} frames to train. Exponents leave out the "
-        "smallest clips, where most of the time is what is done once.\n",
+        f"Processor time of restorations in memory with two passes of the centroid and at most {TRAINED} frames to "
+        "train.  Exponents leave out the smallest clips, where most of the time is what is done once.\n",
         *_growth(full, folder, broken),
         "\n## Cores, videos and batches\n",
         *_others(folder, broken),
@@ -132,33 +183,57 @@ def document(full: bool, before: str | None, tree: Path | None, folder: Path) ->
 
 
 def _restorations(rows: tuple[Clip, ...], tree: Path | None, folder: Path, broken: list[str]) -> list[str]:
-    names = ["clip", "scene", "preset", "runs", *(["before, s", "now / before"] if tree else [])]
-    names += ["now, s", "flow alone, s", "times flow alone", *(f"{stage}, % of wall" for stage in STAGES)]
+    names = ["clip", "scene", "preset", "runs"]
+    names += ["clock before, s", "now / before", "CPU before, s", "now / before"] if tree else []
+    names += ["clock, s", "CPU, s", "start, s", "start, % of CPU", "modules"]
     lines = [f"| {' | '.join(names)} |", f"|---|---|---|{'---:|' * (len(names) - 3)}"]
+    for warmed in {None, tree}:
+        WARM.command(folder, tree=warmed)
+    numpy = _median([{"cpu": run_timed("import numpy", [])[1]} for _ in range(3)], "cpu")
     for clip in rows:
         runs: dict[str, list[Figures]] = {"before": [], "standard": [], "fast": []}
         for _ in range(clip.runs):
             if tree:
-                runs["before"].append(clip.measure(folder, tree))
+                runs["before"].append(clip.command(folder, tree=tree))
             for preset in ("standard", "fast"):
-                runs[preset].append(clip.measure(folder, preset=preset, flow=True))
+                runs[preset].append(clip.command(folder, preset))
         for preset in ("standard", "fast"):
             lines.append(_restoration(clip, preset, runs["before"], runs[preset], broken))
-    return lines
+    start = _median(runs["standard"], "start") / numpy
+    if start > START_BOUND:
+        broken.append(f"the start of a restoration takes {start:.1f} times as long as NumPy's, bound {START_BOUND}")
+    return [*lines, "", f"The start takes {start:.1f} times as long as an import of NumPy, bound {START_BOUND:.0f}."]
 
 
 def _restoration(clip: Clip, preset: str, old: list[Figures], new: list[Figures], broken: list[str]) -> str:
     cells = [str(clip), clip.scene, preset, str(clip.runs)]
-    if old:
-        ratio = float(np.median([now["cpu"] / was["cpu"] for was, now in zip(old, new, strict=True)]))
-        cells += [f"{_median(old, 'cpu'):.2f}", f"{ratio:.2f}"]
-        if clip.runs > 1 and ratio > WHOLE_BOUND:
+    for name in ("seconds", "cpu") if old else ():
+        ratio = float(np.median([now[name] / was[name] for was, now in zip(old, new, strict=True)]))
+        cells += [f"{_median(old, name):.2f}", f"{ratio:.2f}"]
+        if name == "cpu" and clip.runs > 1 and ratio > WHOLE_BOUND:
             broken.append(f"{clip}, {clip.scene}, {preset}: {ratio:.2f} times the time before, bound {WHOLE_BOUND}")
-    cpu, flow = _median(new, "cpu"), _median(new, "flow")
-    cells += [f"{cpu:.2f}", f"{flow:.2f}", f"{cpu / flow:.2f}"]
-    for stage in STAGES:
-        cells.append(f"{100 * np.median([run['stages'].get(stage, 0.0) / run['seconds'] for run in new]):.0f}")
-    return f"| {' | '.join(cells)} |"
+    cpu, start = _median(new, "cpu"), _median(new, "start")
+    cells += [f"{_median(new, 'seconds'):.2f}", f"{cpu:.2f}", f"{start:.2f}", f"{100 * start / cpu:.0f}"]
+    return f"| {' | '.join([*cells, str(new[-1]['modules'])])} |"
+
+
+def stage_costs(folder: Path) -> str:
+    """Seconds of every stage by preset, a megapixel: for each frame, each training frame, or once."""
+    clip = Clip(*STAGES_CLIP)
+    lines = []
+    for preset in STAGES_PRESETS:
+        found = clip.measure(folder, preset=preset)
+        seconds, pixels = found["stages"], clip.height * clip.width / 1e6
+        frames, train = clip.count * pixels, found["train"] * pixels
+        costs = {
+            "read": seconds["read"] / frames,
+            "centroid": seconds["centroid"] / train,
+            "filter": sum(seconds.get(stage, 0) for stage in ("seeing", "identify", "filter")) / frames,
+            "witnesses": seconds["witnesses"] / train,
+            "width and deconvolve": (seconds["deconvolve"] + seconds["uncertainty"]) / pixels,
+        }
+        lines.append(f"{preset}: {', '.join(f'{stage} {cost:.2f}' for stage, cost in costs.items())}")
+    return "\n".join(lines)
 
 
 def _median(runs: list[Figures], name: str) -> float:
@@ -210,15 +285,8 @@ def _others(folder: Path, broken: list[str]) -> list[str]:
 
 def _help_lines(broken: list[str]) -> list[str]:
     """Compare ``turbrestore --help`` with starting Python and importing NumPy, by the median of five pairs."""
-
-    def seconds(code: str) -> float:
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, check=True)
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-
     calls = {name: f"from turbrestore_cli.__main__ import main; main({name.split()!r})" for name in HELP}
-    runs = [(seconds("import numpy"), *map(seconds, calls.values())) for _ in range(5)]
+    runs = [[run_timed(code, [])[1] for code in ("import numpy", *calls.values())] for _ in range(5)]
     lines = []
     for number, name in enumerate(calls, 1):
         taken, ratio = np.median([(run[number], run[number] / run[0]) for run in runs], axis=0)

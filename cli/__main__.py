@@ -36,6 +36,8 @@ def _command(arguments: list[str], ends_process: bool) -> int:
             from .streams import open_closed
 
             open_closed()
+            if arguments in (["--help"], ["-h"]):
+                return _list_commands()
             from .commands import run
 
             return run(arguments)
@@ -45,6 +47,22 @@ def _command(arguments: list[str], ends_process: bool) -> int:
             raise
     sys.stderr.write(f"turbrestore: {heard[0] or 'interrupted'}\n")
     return getattr(heard[0], "exit_code", INTERRUPTED)
+
+
+def _list_commands() -> int:
+    from turbrestore.core.errors import StorageError
+
+    from .overview import overview
+    from .streams import put, silence, tell
+
+    try:
+        put(overview())
+    except BrokenPipeError:
+        silence(sys.stdout)
+    except StorageError as error:
+        tell(f"turbrestore: {error}")
+        return error.exit_code
+    return 0
 
 
 if __name__ == "__main__":

@@ -18,14 +18,11 @@ from turbrestore.io.source import FrameSource
 from turbrestore.memory_plan import training_share
 from turbrestore.metrics import comparable
 from turbrestore.pipeline import restore as run_pipeline
-from turbrestore.report import check_report, write_report
 from turbrestore.results import Restoration
-from turbrestore.runs.run_record import describe_run
 from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.settings import Preset, RestoreParams
 from turbrestore.stacking.placement import settings_of_known_flows
 
-from .cluster import connected, over_workers
 from .inputs import files_read, open_input, read_input_image
 from .kept import check_room, kept_stages, own_outputs
 from .options import Machine, Selection
@@ -38,10 +35,7 @@ from .output import (
     write_result,
     write_settings,
 )
-from .progress import progress_bars, say
-
-# Iterations that a centroid usually takes, and flows that are measured in the time of a deconvolution.
-_ITERATIONS, _FLOWS_A_DECONVOLUTION = 2, 60
+from .progress import USUAL_ITERATIONS, USUAL_PASSES, expected_times, progress_bars, say
 
 
 @dataclass(frozen=True)
@@ -111,7 +105,7 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
     with kept_stages(order.keep, source, params, runtime, order.resume, order.checkpoint_every, order.quiet) as stages:
         with (
             _tile_workers(order, source) as map_tiles,
-            progress_bars(order.quiet, _expected_times(source, params)) as progress,
+            progress_bars(order.quiet, *_expected_times(source, params, order.preset)) as progress,
         ):
             tell_decision = _say_decision if order.verbose else None
             restoration = run_pipeline(source, params, runtime, stages, progress, tell_decision, map_tiles)
@@ -119,7 +113,11 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
             order.params, order.selection, order.bit_depth, order.machine, order.memory_limit, order.preset, order.tile
         )
         command = repeating_command(order.input, order.output, record)
-        run = describe_run(source, record, command) if order.keep or order.report else None
+        run = None
+        if order.keep or order.report:
+            from turbrestore.runs.run_record import describe_run
+
+            run = describe_run(source, record, command)
         depth = source.bit_depth if order.bit_depth is None else order.bit_depth
         if stages is not None and run is not None:
             save_stages(stages, restoration, run, depth)
@@ -129,6 +127,8 @@ def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
         if order.uncertainty is not None and restoration.uncertainty is not None:
             write_map(order.uncertainty, restoration.uncertainty, may_replace(order.uncertainty))
         if order.report is not None and run is not None:
+            from turbrestore.report import write_report
+
             write_report(order.report, restoration, run, overwrite=may_replace(order.report))
         if stages is not None:
             stages.announce_outputs()
@@ -139,12 +139,18 @@ def _say_decision(decision: Decision) -> None:
     say(str(decision), quiet=False)
 
 
-def _expected_times(source: FrameSource, params: RestoreParams) -> dict[str, float]:
-    """Expect times of the stages, in flows: those that they measure, and what deconvolution takes."""
+def _expected_times(
+    source: FrameSource, params: RestoreParams, preset: Preset
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Expect times of the stages that a run has, and the share of its steps that a stage takes."""
     train = training_share(len(source), source.shape[1:], params.train, params.filter.training == "skip")
-    filtered = max(len(source) * params.filter.inner_iterations - train, 1)
-    times = {"centroid": _ITERATIONS * train, "filter": filtered, "deconvolve": _FLOWS_A_DECONVOLUTION}
-    return {stage: float(time) for stage, time in times.items() if params.runs(stage)}
+    found = {"read": True, "witnesses": params.finds_blur, "width": params.finds_blur}
+    times = {
+        stage: time
+        for stage, time in expected_times(preset, len(source), train).items()
+        if (found[stage] if stage in found else params.runs(stage))
+    }
+    return times, {"centroid": min(USUAL_PASSES / params.centroid.iterations, 1.0), "deconvolve": USUAL_ITERATIONS}
 
 
 @contextmanager
@@ -159,6 +165,8 @@ def _tile_workers(order: Order, source: FrameSource) -> Iterator[TileMap | None]
         )
         yield None
     else:
+        from .cluster import connected, over_workers
+
         with connected(order.scheduler, order.workers or 1, order.quiet) as client:
             yield over_workers(client)
 
@@ -187,6 +195,8 @@ def _check_outputs(order: Order) -> Callable[[Path], bool]:
         )
         check_output(order.uncertainty, inputs, may_replace(order.uncertainty), (".tif", ".tiff"))
     if order.report is not None:
+        from turbrestore.report import check_report
+
         check_report(order.report, inputs, may_replace(order.report))
     check_keep(order.keep, [*inputs, *order.outputs], order.overwrite, order.resume)
     return may_replace

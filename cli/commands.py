@@ -14,36 +14,10 @@ from turbrestore.core.errors import ConfigurationError, StorageError, Turbrestor
 
 from .examples import EXAMPLES, FIRST_STEPS, epilogue
 from .help import EVERYTHING, Formatter
+from .overview import COMMANDS, MOMENTS, SUMMARY
 from .settings import settings_file
 from .signals import INTERRUPTED
 from .streams import flush, silence, tell
-
-# Where each command lives, and what it says in one line.
-COMMANDS = {
-    "restore": ("restore:restore", "Restore one sharp image from a video."),
-    "steady": ("steady:steady", "Steady and sharpen a video."),
-    "register": ("register:register", "Write the frames registered, not stacked."),
-    "batch": ("batch:batch", "Restore many videos side by side."),
-    "align": ("align:align", "Align results to each other."),
-    "report": ("report:report", "Write the report of a kept run."),
-    "seeing": ("seeing:seeing", "Measure the strength of the turbulence."),
-    "centroid": ("stages:centroid", "Find the centroid of a video."),
-    "flow": ("stages:flow", "Measure the flow from an image to all frames."),
-    "identify": ("stages:identify", "Identify the dynamics of flows."),
-    "predict": ("stages:predict", "Predict a frame from the one before."),
-    "filter": ("stages:filter_", "Filter with known centroid and dynamics."),
-    "deconvolve": ("deblurring:deconvolve", "Deblur an image, or compare widths."),
-    "synthesize": ("synthesis:synthesize", "Make a turbulent video with known truth."),
-    "sample": ("sample:sample", "Write a small clip to try, with its truth."),
-    "info": ("inspection:info", "Say what a video is."),
-    "evaluate": ("inspection:evaluate", "Compare a result with the truth."),
-    "app": ("app:app", "Choose, restore and tune a clip in the browser."),
-    "config": ("config:config", "Write or check a settings file."),
-    "doctor": ("doctor:doctor", "Check what this installation can do."),
-    "moments wavefront": ("moments:wavefront", "A wavefront sensor that is exposed all the time."),
-    "moments mirror": ("moments:mirror", "A steered mirror seen by a slow camera."),
-    "--install-completion": ("completion:install_completion", "Complete words in bash, zsh or fish."),
-}
 
 USAGES = {
     "align": "Usage: turbrestore align [OPTIONS] RESULT... FOLDER",
@@ -59,7 +33,7 @@ def build(explain_all: bool = False) -> App:
     """Assemble the application; commands are imported when they run."""
     app = App(
         name="turbrestore",
-        help="Restore one sharp image from a video of a static scene seen through atmospheric turbulence.",
+        help=SUMMARY,
         help_epilogue=epilogue(FIRST_STEPS),
         version=__version__,
         config=settings_file,
@@ -72,7 +46,7 @@ def build(explain_all: bool = False) -> App:
         "": app,
         "moments": App(
             name="moments",
-            help="Estimate fast motion from slow sensors.",
+            help=MOMENTS,
             help_epilogue=epilogue(EXAMPLES["moments wavefront"] + EXAMPLES["moments mirror"]),
         ),
     }

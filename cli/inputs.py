@@ -7,9 +7,7 @@ from pathlib import Path
 
 from turbrestore.core.arrays import FloatArray, check_image
 from turbrestore.core.errors import DataError, require
-from turbrestore.footage.calibration import calibrated, make_calibration
 from turbrestore.footage.checks.content import ContentParams, ContentReport, check_content, clean_source
-from turbrestore.footage.object_crop import crop_to_object
 from turbrestore.io.astronomy.fits import open_fits
 from turbrestore.io.astronomy.fits_header import is_fits
 from turbrestore.io.images import IMAGE_SUFFIXES, read_image, read_pixels
@@ -21,7 +19,6 @@ from turbrestore.io.video import open_frames
 from turbrestore.memory_plan import training_share
 from turbrestore.runs.stage_files import load_guide, load_stage_image
 from turbrestore.settings import RestoreParams
-from turbrestore.stacking.derotation import derotated, read_rotation
 
 from .options import Selection
 from .progress import say
@@ -54,8 +51,13 @@ def open_checked(input: Path, selection: Selection) -> tuple[FrameSource, Conten
         hdr=selection.hdr,
     )
     source = _calibrated(source, selection)
-    source = crop_to_object(source) if selection.crop_to_object else source
+    if selection.crop_to_object:
+        from turbrestore.footage.object_crop import crop_to_object
+
+        source = crop_to_object(source)
     if selection.derotate is not None:
+        from turbrestore.stacking.derotation import derotated, read_rotation
+
         source = derotated(source, read_rotation(selection.derotate))
     return source, check_content(source, ContentParams(strict=selection.strict))
 
@@ -110,6 +112,8 @@ def _calibrated(source: FrameSource, selection: Selection) -> FrameSource:
     """Take out what ``--dark`` and ``--flat`` name."""
     if selection.dark is None and selection.flat is None:
         return source
+    from turbrestore.footage.calibration import calibrated, make_calibration
+
     limits = selection.limits()
     dark, flat = (
         None if name is None else _open_frame(Path(name), limits) for name in (selection.dark, selection.flat)

@@ -18,7 +18,6 @@ import tomli_w
 from turbrestore import __version__
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import OutputError
-from turbrestore.footage.object_crop import without_sky
 from turbrestore.io.astronomy.fits_header import is_fits
 from turbrestore.io.astronomy.fits_output import FITS_OUTPUT_SUFFIX, write_fits
 from turbrestore.io.images import write_image
@@ -29,7 +28,6 @@ from turbrestore.results import Restoration
 from turbrestore.runs.folder_lock import LOCK
 from turbrestore.runs.run_files import REPORT, RUN_FILES, read_stages
 from turbrestore.runs.run_folder import CHECKPOINT, RunFolder, is_part
-from turbrestore.runs.run_record import RunRecord
 from turbrestore.runs.stage_files import save_flows
 from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.runtime.scratch import iter_frames
@@ -40,6 +38,8 @@ from .streams import put
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from turbrestore.runs.run_record import RunRecord
 
 FLOW_FILE = (".npy", FITS_OUTPUT_SUFFIX)
 _SHORT = {"deconvolution.sigma": "sigma"}
@@ -123,6 +123,8 @@ def write_result(
         write_image(path, image, bit_depth, overwrite, source.levels)
         return
     if finer is not None:
+        from turbrestore.footage.object_crop import without_sky
+
         # Both are those of the grid of the frames.
         header, uncertainty = without_sky(header), None
     x, y, *_ = restoration.crop

@@ -112,14 +112,18 @@ LIBRARIES = {
     "uvicorn",
 }
 # What takes longest to import of the libraries that a command needs.
-SLOW = {"scipy.stats", "scipy.ndimage"}
+SLOW = {"scipy.fft", "scipy.linalg", "scipy.ndimage", "scipy.optimize", "scipy.sparse", "scipy.special", "scipy.stats"}
+PARSER = {"cyclopts", "rich"}
+# What a restoration takes only where an option asks for it.
+ON_DEMAND = LIBRARIES - {"cv2", "numba", "scipy"} | {"rich", "skimage", "PIL", "imageio", "tifffile", "rawpy", "jinja2"}
+ON_DEMAND |= {"turbrestore.report"}
 
 
 @pytest.mark.parametrize(
     ("action", "absent"),
     [
         ("import turbrestore", LIBRARIES | {"numpy"}),
-        ("import turbrestore_cli.__main__ as m; m.main(['--help'])", LIBRARIES),
+        ("import turbrestore_cli.__main__ as m; m.main(['--help'])", LIBRARIES | PARSER),
         ("import turbrestore_cli.__main__ as m; m.main(['restore', '--help'])", LIBRARIES - {"cv2", "scipy"} | SLOW),
         ("import turbrestore_cli.__main__ as m; m.main(['app', '--help'])", LIBRARIES),
     ],
@@ -128,6 +132,13 @@ def test_nothing_heavy_is_loaded(action, absent):
     code = f"{action}\nimport sys\nprint(sorted({absent} & set(sys.modules)))"
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert output.splitlines()[-1] == "[]"
+
+
+def test_a_restoration_loads_nothing_that_no_option_asks_for(tmp_path):
+    clip = PACKAGE.parent / "sample_data" / "chart.mkv"
+    words = ["restore", str(clip), str(tmp_path / "a.png"), "--preset", "fast", "--quiet"]
+    words += ["--frames", "0:16", "--roi", "64,64,64,64"]
+    test_nothing_heavy_is_loaded(f"import turbrestore_cli.__main__ as m; assert m.main({words}) == 0", ON_DEMAND)
 
 
 def test_public_names_load_and_hide_no_module():

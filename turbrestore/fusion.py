@@ -55,6 +55,9 @@ _MOST_BITS = 16
 # Figures of a filtered tile that are joined or averaged.
 _RECORDED = ("flow_states", "gains", "innovations", "sharpness", "shares", "image_noise", "sharpness_weight")
 
+# Stages that take a while and have no steps to count.
+_WITHOUT_STEPS = ("witnesses",)
+
 Result = TypeVar("Result")
 
 
@@ -93,8 +96,12 @@ class Run:
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
         """Add the time that something takes to that of a stage."""
-        begun = time.perf_counter()
+        begun, told = time.perf_counter(), self.progress if stage in _WITHOUT_STEPS else None
+        if told is not None:
+            told(stage, 0, 1)
         yield
+        if told is not None:
+            told(stage, 1, 1)
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begun
 
     def stage(self, stage: str, name: str, compute: Callable[[], Result]) -> Result:

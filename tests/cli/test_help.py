@@ -4,6 +4,7 @@ import re
 
 import pytest
 
+from turbrestore_cli.__main__ import main
 from turbrestore_cli.commands import COMMANDS, build
 from turbrestore_cli.help import _cut
 
@@ -52,6 +53,14 @@ def test_the_list_of_commands_has_a_line_for_each(run):
     lines = text.split("Commands:")[1].split("Examples:")[0].strip().splitlines()
     assert len(lines) == len({words.split()[0] for words in COMMANDS}) + 2
     assert all(len(line) <= 80 for line in lines)
+
+
+@pytest.mark.parametrize("columns", ["60", "80", "200"])
+def test_the_list_that_comes_at_once_is_that_of_the_parser(run, capsys, monkeypatch, columns):
+    monkeypatch.setenv("COLUMNS", columns)
+    _, parsed, _ = run("--help")
+    assert main(["--help"]) == 0
+    assert capsys.readouterr().out.split("\n") == [line.rstrip() for line in parsed.split("\n")]
 
 
 def test_a_text_is_cut_at_the_end_of_a_clause():

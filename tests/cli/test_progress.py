@@ -1,27 +1,46 @@
 """One bar for the whole command, the verdict at its end, and decisions as they are made."""
 
+import numpy as np
+import pytest
 from command_line import QUICK
 
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.pipeline import restore
 from turbrestore.settings import PRESETS, RestoreParams
 from turbrestore_cli.clip import _expected_times
-from turbrestore_cli.progress import TITLES, share_done
+from turbrestore_cli.progress import TITLES, TimeLeft, share_done
 
 
 def test_the_bar_only_moves_on_and_ends_full(sequence):
-    sharper = DeconvolutionParams(sigma=1.0)
-    for params in (RestoreParams(deconvolution=sharper), RestoreParams(until="filter"), PRESETS["fast"]):
+    sharper = RestoreParams(deconvolution=DeconvolutionParams(sigma=1.0))
+    for name, params in (("standard", sharper), ("standard", RestoreParams(until="filter")), ("fast", PRESETS["fast"])):
         calls = []
         restore(sequence.frames, params, progress=lambda *call, calls=calls: calls.append(call))
-        weights = _expected_times(_Source(sequence.frames), params)
-        shares = [share_done(weights, *call) for call in calls]
+        weights, usual = _expected_times(_Source(sequence.frames), params, name)
+        shares = [share_done(weights, *call, usual.get(call[0], 1)) for call in calls]
         assert {stage for stage, *_ in calls} <= set(weights) <= set(TITLES)
         assert shares == sorted(shares)
         # Without a blur to remove, the bar jumps over the deconvolution.
-        assert 0 < shares[0] < 0.1 and 0.3 < shares[-1] <= 1
+        assert 0 < shares[0] < 0.2 and 0.3 < shares[-1] <= 1
         # No stage counts as done before the next begins.
         assert len({round(share, 3) for share in shares}) > len(weights)
+
+
+def test_a_stage_that_usually_ends_early_has_its_share_by_then():
+    times, usual = _expected_times(_Source(np.empty((100, 16, 16))), RestoreParams(), "standard")
+    passes = RestoreParams().centroid.iterations
+    place = [share_done(times, "centroid", done, passes, usual["centroid"]) for done in (0, 1, 2, passes)]
+    assert place[0] == times["read"] / sum(times.values())
+    assert place[1] - place[0] == pytest.approx(times["centroid"] / sum(times.values()) / 2)
+    assert place[2] == place[3] == share_done(times, "filter", 0, 9)
+
+
+def test_the_time_that_is_left_never_rises():
+    now = [0.0]
+    left = TimeLeft(lambda: now[0])
+    assert left.text(0) == ""
+    for now[0], share, text in ((10, 0.1, "1:30"), (20, 0.1, "1:30"), (30, 0.3, "1:10"), (90, 0.9, "0:10")):
+        assert left.text(share) == text
 
 
 class _Source:

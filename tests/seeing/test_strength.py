@@ -6,6 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import scipy
 
 import turbrestore
 from turbrestore.footage.bars import Bars
@@ -15,7 +16,7 @@ from turbrestore.io.video import write_video
 from turbrestore.preparation import Prepared
 from turbrestore.registration.centroid import Centroid, find_centroid
 from turbrestore.seeing.displacement import Displacement
-from turbrestore.seeing.strength import Seeing, measure_seeing, seeing_of_picture
+from turbrestore.seeing.strength import Seeing, chi_square_quantile, measure_seeing, seeing_of_picture
 from turbrestore.seeing.tilt_theory import Optics
 from turbrestore.synthesis.anisoplanatic import phase_screen_frames
 from turbrestore.synthesis.atmosphere import PhaseScreenParams
@@ -38,6 +39,13 @@ def clip() -> tuple[np.ndarray, Centroid]:
 def measure(clip, **kwargs) -> Seeing:
     frames, centroid = clip
     return measure_seeing(frames, centroid.flows, centroid.image, frames.mean(axis=0), **kwargs)
+
+
+def test_quantiles_are_those_of_scipy():
+    for freedom in (0.3, 1, 1.5, 10, 278, 1e5):
+        for share in (0.025, 0.975):
+            exact = scipy.special.chdtri(freedom, 1 - share)
+            assert chi_square_quantile(freedom, share) == pytest.approx(exact, rel=1e-9)
 
 
 def test_strength_of_a_known_path(clip):

@@ -95,14 +95,16 @@ def fewer_edges(edges: Edges, most: int) -> Edges:
 
 def edge_profiles(image: FloatArray, edges: Edges, reach: int) -> tuple[FloatArray, FloatArray]:
     """Profiles (n, reach + 1) of an image (H, W) along the normals of n edges, on the bright and on the dark side."""
-    # Commands that estimate no blur start faster without it.
-    from scipy import ndimage
-
-    distances = np.arange(reach + 1, dtype=np.float32)
+    distances, rim = np.arange(reach + 1, dtype=np.float32), reach + 1
+    padded = cv2.copyMakeBorder(image, rim, rim, rim, rim, cv2.BORDER_REFLECT_101)
+    values, row = padded.ravel(), padded.shape[1]
     sides = []
     for sign in (1, -1):
-        at = edges.places.T[..., None] + sign * edges.normals.T[..., None] * distances
-        sides.append(sign * ndimage.map_coordinates(image, at, np.float32, order=1, mode="mirror"))
+        at = edges.places.T[..., None] + sign * edges.normals.T[..., None] * distances + np.float32(rim)
+        corner = at.astype(np.intp)
+        (down, along), place = at - corner.astype(np.float32), corner[0] * row + corner[1]
+        upper, lower = (values[n] + along * (values[n + 1] - values[n]) for n in (place, place + row))
+        sides.append(sign * (upper + down * (lower - upper)))
     return sides[0], sides[1]
 
 

@@ -38,7 +38,6 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_grey
@@ -46,6 +45,7 @@ from ..core.errors import require
 from ..core.noise import estimate_noise
 from ..display.curves import plot_blur
 from ..display.preview import preview
+from ..runtime.fourier import fast_length
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import ThreadTeam, one_thread_each
 from .edges import edge_limit
@@ -341,7 +341,7 @@ def _detail(image: FloatArray, start: int, stop: int) -> FloatArray:
 
 def _fast_size(size: int) -> int:
     """Largest size up to ``size`` whose transform is fast."""
-    fast = (n for n in range(size // 2, size + 1) if scipy.fft.next_fast_len(n, real=True) == n)
+    fast = (n for n in range(size // 2, size + 1) if fast_length(n) == n)
     return max(n for n in fast if n != _SLOW_SIZE)
 
 

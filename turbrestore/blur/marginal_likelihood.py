@@ -34,7 +34,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import scipy
 
 from ..core.arrays import FloatArray
 from ..runtime.jit import jit
@@ -68,7 +67,7 @@ def image_gradients(image: FloatArray) -> ImageGradients:
     dx, dy = image[:-1, 1:] - image[:-1, :-1], image[1:, :-1] - image[:-1, :-1]
     rows, columns = (_taper(size) for size in dx.shape)
     planes = np.stack([dx, dy], axis=-1) * np.outer(rows, columns)[..., None]
-    frequency = np.hypot(scipy.fft.fftfreq(len(rows))[:, None], scipy.fft.fftfreq(len(columns)))
+    frequency = np.hypot(np.fft.fftfreq(len(rows))[:, None], np.fft.fftfreq(len(columns)))
     return ImageGradients(planes, cv2.dft(planes), frequency.astype(np.float32))
 
 

@@ -8,14 +8,13 @@ k : point spread function (PSF), sums to 1; its Fourier transform is the transfe
 p : exponent of the transfer function
 n : standard deviation of the noise, intensity
 
-Transfer functions are half-spectra with the layout of :func:`scipy.fft.rfft2`, so
+Transfer functions are half-spectra with the layout of :func:`numpy.fft.rfft2`, so
 ``irfft2(otf * rfft2(u), s=u.shape)`` is the periodic convolution k ∗ u.
 """
 
 from __future__ import annotations
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.arrays import FloatArray
@@ -80,7 +79,7 @@ def psf_to_otf(psf: ArrayLike, shape: tuple[int, int]) -> NDArray[np.complex64]:
     grid = np.zeros(shape)
     grid[:height, :width] = kernel
     grid = np.roll(grid, (-(height // 2), -(width // 2)), axis=(0, 1))
-    return scipy.fft.rfft2(grid).astype(np.complex64)
+    return np.fft.rfft2(grid).astype(np.complex64)
 
 
 def check_psf(psf: ArrayLike) -> Float64Array:
@@ -100,5 +99,5 @@ def laplacian_symbol(height: int, width: int) -> FloatArray:
     return (rows + columns).astype(np.float32)
 
 
-def _frequencies(shape: tuple[int, ...]) -> tuple[Float64Array, Float64Array]:
-    return scipy.fft.fftfreq(shape[0])[:, None], scipy.fft.rfftfreq(shape[1])
+def _frequencies(shape: tuple[int, ...]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    return np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])

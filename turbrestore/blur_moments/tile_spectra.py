@@ -18,11 +18,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
 from ..core.errors import DataError, require, require_between
+from ..runtime.fourier import rfft2
 
 Float64Array = NDArray[np.float64]
 
@@ -91,7 +91,7 @@ class TileSpectra:
         grid = TileGrid(rows, columns, (height, width), (shape[0], shape[1]))
         window = np.outer(_hann(height), _hann(width))
         window /= np.sqrt(np.sum(window**2))
-        ky, kx = np.meshgrid(scipy.fft.fftfreq(height), scipy.fft.rfftfreq(width), indexing="ij")
+        ky, kx = np.meshgrid(np.fft.fftfreq(height), np.fft.rfftfreq(width), indexing="ij")
         radius = np.hypot(kx, ky)
         # Half of the plane suffices, because the power spectrum of an image is symmetric.
         half = (kx > 0) | (ky > 0)
@@ -109,9 +109,7 @@ class TileSpectra:
         power = np.empty((len(self.grid.rows), len(self.grid.columns), len(self.used)), image.dtype)
         # One row of tiles at a time: all windowed and transformed tiles take fifteen times the memory of the image.
         for row, found in zip(self.grid.rows, power, strict=True):
-            spectrum = scipy.fft.rfft2(tiles[row, self.grid.columns] * self.window).reshape(len(found), -1)[
-                :, self.used
-            ]
+            spectrum = rfft2(tiles[row, self.grid.columns] * self.window).reshape(len(found), -1)[:, self.used]
             np.add(spectrum.real**2, spectrum.imag**2, out=found)
         return power.reshape(-1, len(self.used))
 

@@ -27,13 +27,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from ..blur.psf import check_psf
 from ..core.arrays import FloatArray
 from ..core.errors import require
 from ..core.noise import NoiseCurve
+from ..runtime.fourier import fast_length, irfft2, rfft2
 from ..runtime.image_stacks import Stack, load, namespace
 
 # Smallest margin, in widths of the blur.
@@ -68,13 +68,13 @@ class Problem:
         """Half-spectrum of an image."""
         if not isinstance(image, np.ndarray):
             return namespace(image).fft.rfft2(image)
-        return scipy.fft.rfft2(image, workers=self._workers)
+        return rfft2(image, self._workers)
 
     def back(self, spectrum: Stack) -> Stack:
         """Image of a half-spectrum."""
         if not isinstance(spectrum, np.ndarray):
             return namespace(spectrum).fft.irfft2(spectrum, s=self.shape)
-        return scipy.fft.irfft2(spectrum, s=self.shape, workers=self._workers)
+        return irfft2(spectrum, self.shape, self._workers)
 
     @property
     def _workers(self) -> int:
@@ -131,7 +131,7 @@ def margin_around(size: tuple[int, int], least: int | None) -> Margin:
     """Margin of at least ``least`` pixels on each side, enlarged to a size with a fast Fourier transform."""
     if least is None:
         return Margin(size, ((0, 0), (0, 0)))
-    extra = [scipy.fft.next_fast_len(length + 2 * least, real=True) - length for length in size]
+    extra = [fast_length(length + 2 * least) - length for length in size]
     top, left = (total // 2 for total in extra)
     return Margin(size, ((top, extra[0] - top), (left, extra[1] - left)))
 

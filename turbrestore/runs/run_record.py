@@ -8,7 +8,6 @@ import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from turbrestore import __version__
@@ -117,6 +116,8 @@ def versions() -> dict[str, str]:
 @functools.cache
 def _package_versions() -> dict[str, str]:
     """Versions of the packages that compute, each of which is read from a file of metadata."""
+    from importlib.metadata import PackageNotFoundError, version
+
     found = {}
     for name in _PACKAGES:
         try:

@@ -12,12 +12,14 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, ContextDecorator, ExitStack, contextmanager
 from itertools import islice
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import TYPE_CHECKING, Self, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import ThreadpoolController
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 # Freeing an array of this size raises the threshold of glibc from which it maps arrays one by one; bytes.
 _THRESHOLD_BYTES = 31 << 20
@@ -235,6 +237,8 @@ def one_thread_each() -> WhileInside:
 @functools.cache
 def _controller() -> ThreadpoolController:
     """Libraries with threads of their own; finding them takes a millisecond, as long as a small frame."""
+    from threadpoolctl import ThreadpoolController
+
     return ThreadpoolController()
 
 

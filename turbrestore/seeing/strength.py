@@ -22,13 +22,13 @@ then no gradient of a phase.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import Any
 
 import numpy as np
-import scipy
 
 from ..blur_moments.cues import relative_blur
 from ..blur_moments.tile_spectra import CueParams
@@ -280,9 +280,26 @@ def measure_seeing(
 
 def chi_square_interval(variance: float, freedom: float, relative: float = 0.0) -> Estimate:
     """95 % interval of a variance with ν degrees of freedom and an independent relative error."""
-    upper, lower = (max(float(scipy.special.chdtri(freedom, share)) / freedom, 1e-12) for share in (0.025, 0.975))
+    lower, upper = (max(chi_square_quantile(freedom, share) / freedom, 1e-12) for share in (0.025, 0.975))
     below, above = (np.hypot(np.log(quantile), _DEVIATIONS * relative) for quantile in (upper, lower))
     return Estimate(variance, float(variance * np.exp(-below)), float(variance * np.exp(above)))
+
+
+def chi_square_quantile(freedom: float, share: float) -> float:
+    """Value below which χ² with ν degrees of freedom remains with a probability of ``share``.
+
+    Newton steps on a logarithmic scale from the approximation of Wilson and Hilferty; the probability is the power
+    series of the incomplete gamma function.
+    """
+    shape, deviation = freedom / 2, NormalDist().inv_cdf(share)
+    x, step = shape * max(1 - 1 / (9 * shape) + deviation / (3 * math.sqrt(shape)), 0.1) ** 3, 1.0
+    while abs(step) > 1e-9:
+        count = 60 + max(x - shape, 0) + 12 * math.sqrt(x)
+        series = 1 + float(np.cumprod(x / (shape + np.arange(1, count))).sum())
+        density = math.exp(shape * math.log(x) - x - math.lgamma(shape))
+        step = min(max((share - density / shape * series) / density, -1), 1)
+        x *= math.exp(step)
+    return 2 * x
 
 
 def _interval(variance: float, motion: MotionStatistics, freedom: float) -> Estimate:

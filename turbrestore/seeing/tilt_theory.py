@@ -32,7 +32,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from ..core.errors import ConfigurationError, require, require_between
@@ -123,6 +122,8 @@ def displacement_differences(optics: Optics, spacing: float, counts: tuple[int, 
 
     Returns (rows, columns, 2).
     """
+    from scipy.special import jv
+
     require(optics.distance is not None, "distance: expected that of the scene, found none")
     distance = float(optics.distance or 0.0)
     nodes, weights = np.polynomial.legendre.leggauss(_SLICES)
@@ -134,7 +135,7 @@ def displacement_differences(optics: Optics, spacing: float, counts: tuple[int, 
         f = np.geomspace(1e-3 / (pixel * spacing * max(counts) + cone), 30 / cone, _FREQUENCIES)
         x, y = (f[:, None] * part(angles) for part in (np.cos, np.sin))
         phase = np.pi * cone * f
-        response = cone / optics.aperture * optics.wavelength * 8 * scipy.special.jv(2, phase) / phase**2
+        response = cone / optics.aperture * optics.wavelength * 8 * jv(2, phase) / phase**2
         r0 = fried_parameter(1.0, thickness, optics.wavelength, 1.0)
         # d²f = f df dangle, and df = f d(log f).
         power = response**2 * phase_spectrum(f, r0, _NO_OUTER_SCALE, 0.0) * f**2 * np.log(f[1] / f[0])

@@ -20,10 +20,10 @@ import functools
 
 import cv2
 import numpy as np
-import scipy
 
 from ..blur.psf import blur_otf, laplacian_symbol
 from ..core.arrays import FloatArray
+from ..runtime.fourier import fast_length, irfft2, rfft2
 
 # Weight of contrast over noise as in conjugate_gradient.wiener_fidelity.
 _FIDELITY = 6.0
@@ -45,18 +45,16 @@ def deblur(
     height, width = image.shape[:2]
     margin = min(int(np.ceil(_MARGIN * max(sigma))), height - 1, width - 1)
     padded = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_REFLECT_101)
-    shape = scipy.fft.next_fast_len(padded.shape[0], real=True), scipy.fft.next_fast_len(padded.shape[1], real=True)
+    shape = fast_length(padded.shape[0]), fast_length(padded.shape[1])
     below, right = shape[0] - padded.shape[0], shape[1] - padded.shape[1]
     padded = cv2.copyMakeBorder(padded, 0, below, 0, right, cv2.BORDER_REPLICATE)
-    planes = scipy.fft.rfft2(padded[None] if image.ndim == 2 else np.moveaxis(padded, -1, 0))
+    planes = rfft2(padded[None] if image.ndim == 2 else np.moveaxis(padded, -1, 0))
     contrast, inner = float(image.std()), np.s_[:, margin : margin + height, margin : margin + width]
 
     def filtered(kind: int) -> FloatArray:
         power, otf, laplacian = _transfer(shape, sigma[kind], exponent)
         fidelity = max(_FIDELITY * contrast / float(np.hypot(noise[kind], _LEAST_NOISE[kind])), 1.0)
-        return scipy.fft.irfft2(planes * (fidelity * otf / (fidelity * power + laplacian)), shape)[inner].astype(
-            np.float32
-        )
+        return irfft2(planes * (fidelity * otf / (fidelity * power + laplacian)), shape)[inner].astype(np.float32)
 
     result = filtered(0)
     share = 1 - 1 / np.sqrt(held)

@@ -29,7 +29,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.errors import ConfigurationError, require, require_between
@@ -245,6 +244,8 @@ def tilt_variance(
 
     Each layer adds ``(2λ/πD)² 16π ∫ Φ(f) (J2(πγDf)/πγDf)² f df``, with Noll's (1976) filter of Zernike tilt.
     """
+    from scipy.special import jv
+
     total = 0.0
     for layer in layers:
         diameter = layer.shrink * aperture
@@ -252,7 +253,7 @@ def tilt_variance(
         highest = 30 / diameter if inner_scale == 0 else min(30 / diameter, 4 / inner_scale)
         f = np.geomspace(1e-3 / outer_scale, max(highest, 10 / outer_scale), _QUADRATURE)
         x = np.pi * diameter * f
-        power = phase_spectrum(f, layer.r0, outer_scale, inner_scale) * (scipy.special.jv(2, x) / x) ** 2 * f
+        power = phase_spectrum(f, layer.r0, outer_scale, inner_scale) * (jv(2, x) / x) ** 2 * f
         total += float(np.trapezoid(power * f, np.log(f)))
     return total * 16 * np.pi * (2 * wavelength / (np.pi * aperture)) ** 2
 

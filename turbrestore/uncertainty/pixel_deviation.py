@@ -36,7 +36,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from ..blind.remove_blur import Deblurred
@@ -49,6 +48,7 @@ from ..deconvolution.deconvolve import DeconvolutionParams, automatic_fidelity
 from ..deconvolution.problem import MARGIN_SIGMAS, margin_around
 from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import Filtered
+from ..runtime.fourier import irfft2, rfft2
 
 # Full scale, less half a grey level of 8 bits.
 SATURATED = 1 - 0.5 / 255
@@ -111,7 +111,7 @@ def posterior_gain(size: tuple[int, int], fidelity: float, sigma: float, exponen
     shape = (min(size[0], _GRID), min(size[1], _GRID))
     power = np.abs(blur_otf(shape, sigma, exponent or GAUSSIAN)) ** 2
     # The first value of the inverse transform is the mean over all frequencies, of which half are stored.
-    return float(scipy.fft.irfft2(1 / (power + laplacian_symbol(*shape) / fidelity), s=shape)[0, 0])
+    return float(np.fft.irfft2(1 / (power + laplacian_symbol(*shape) / fidelity), s=shape)[0, 0])
 
 
 def variance_by_blur(fused: FloatArray, fidelity: float, widths: tuple[float, float], exponent: float) -> FloatArray:
@@ -121,11 +121,11 @@ def variance_by_blur(fused: FloatArray, fidelity: float, widths: tuple[float, fl
     """
     reach = int(np.ceil(MARGIN_SIGMAS * widths[1]))
     margin = margin_around((fused.shape[0], fused.shape[1]), reach)
-    spectrum = scipy.fft.rfft2(margin.pad(luminance(fused)))
+    spectrum = rfft2(margin.pad(luminance(fused)))
     prior = laplacian_symbol(*margin.shape) / fidelity
     otfs = (blur_otf(margin.shape, width, exponent) for width in widths)
     low, high = (otf / (otf**2 + prior) for otf in otfs)
-    between = scipy.fft.irfft2(spectrum * (high - low), s=margin.shape)[margin.inside()] / 2
+    between = irfft2(spectrum * (high - low), margin.shape)[margin.inside()] / 2
     return cv2.GaussianBlur(np.square(between).astype(np.float32), (0, 0), _WINDOW)
 
 

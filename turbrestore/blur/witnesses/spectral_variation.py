@@ -20,7 +20,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray, luminance
@@ -120,7 +119,7 @@ def window_power(image: FloatArray, reduction: int = 1) -> Float64Array:
         _reduced(image, top, left, SIDE, reduction)[_BORDER:-_BORDER, _BORDER:-_BORDER]
         for top, left in _corners(height, width)
     ]
-    return np.mean([_by_ring(np.square(np.abs(scipy.fft.fft2(_windowed(part))))) for part in parts], axis=0)
+    return np.mean([_by_ring(np.square(np.abs(_transform(_windowed(part))))) for part in parts], axis=0)
 
 
 def _corners(height: int, width: int) -> list[tuple[int, int]]:
@@ -167,7 +166,11 @@ def _warped(plane: FloatArray, flow: FloatArray) -> FloatArray:
 
 
 def _spectrum(plane: FloatArray) -> NDArray[np.complex64]:
-    return scipy.fft.fft2(_windowed(plane[_BORDER:-_BORDER, _BORDER:-_BORDER]))
+    return _transform(_windowed(plane[_BORDER:-_BORDER, _BORDER:-_BORDER]))
+
+
+def _transform(window: FloatArray) -> NDArray[np.complex64]:
+    return cv2.dft(window, flags=cv2.DFT_COMPLEX_OUTPUT).view(np.complex64)[..., 0]
 
 
 def _windowed(part: FloatArray) -> FloatArray:
@@ -184,7 +187,7 @@ def _profile() -> FloatArray:
 @functools.cache
 def _rings() -> tuple[NDArray[np.int_], NDArray[np.int_]]:
     """Ring of every frequency of a window, and the number of frequencies in each ring."""
-    nu = scipy.fft.fftfreq(SIDE)
+    nu = np.fft.fftfreq(SIDE)
     ring = np.rint(np.hypot(nu[:, None], nu) * SIDE).astype(int).ravel()
     return ring, np.bincount(ring, minlength=len(RINGS))[: len(RINGS)]
 

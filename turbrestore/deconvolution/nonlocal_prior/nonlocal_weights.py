@@ -21,7 +21,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.arrays import FloatArray, check_grey
@@ -124,17 +123,34 @@ class NonlocalGraph:
         ``‖D‖² = ρ(DᵀD) ≤ ρ(|D|ᵀ|D|)``, and for a non-negative matrix A and any positive x, ``ρ(A) ≤ max_i (Ax)_i/x_i``
         (Collatz–Wielandt).  The bound falls with each power of A that is applied to x.
         """
-        size = self.shape[0] * self.shape[1]
-        weights = scipy.sparse.csr_array((self.roots**2, self.heads, self.starts), shape=(size, size))
-        x, bound = np.ones(size, np.float32), np.inf
-        degrees = weights @ x + weights.T @ x
+        x, bound = np.ones(self.shape[0] * self.shape[1], np.float32), np.inf
+        degrees = np.zeros_like(x)
+        add_neighbours(x, self.starts, self.heads, self.roots, degrees)
         for _ in range(POWERS):
             # Pixels without pairs do not take part.
             x = np.maximum(x / x.max(), np.float32(1e-6))
-            product = weights @ x + weights.T @ x + degrees * x
+            product = degrees * x
+            add_neighbours(x, self.starts, self.heads, self.roots, product)
             bound = min(bound, float((product / x).max()))
             x = product
         return 2 * bound
+
+
+@jit
+def add_neighbours(
+    x: FloatArray, starts: NDArray[np.int32], heads: NDArray[np.int32], roots: FloatArray, sums: FloatArray
+) -> None:
+    """Add, to each pixel, the values x of the pixels that it makes a pair with, times their weights.
+
+    ``x, sums`` (H · W,); ``starts, heads, roots`` as of the graph.
+    """
+    for tail in range(x.size):
+        own, total = x[tail], np.float32(0)
+        for pair in range(np.uintp(starts[tail]), np.uintp(starts[tail + 1])):
+            head, weight = np.uintp(heads[pair]), roots[pair] * roots[pair]
+            total += weight * x[head]
+            sums[head] += weight * own
+        sums[tail] += total
 
 
 def nonlocal_weights(guide: ArrayLike, params: NonlocalParams | None = None, threads: int = 0) -> NonlocalGraph:

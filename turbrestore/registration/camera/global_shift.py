@@ -22,11 +22,11 @@ from typing import Any, TypeVar
 
 import cv2
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.arrays import FloatArray, check_frames, check_image, luminance
 from ...core.errors import DataError
+from ...runtime.fourier import irfft2, rfft2
 from ...runtime.scratch import iter_frames
 from ...runtime.threads import map_ahead
 
@@ -205,16 +205,16 @@ def _common_shift(flow: FloatArray) -> FloatArray | None:
 
 def _spectrum(reduced: FloatArray) -> NDArray[np.complex64]:
     window = cv2.createHanningWindow((max(reduced.shape[1], 2), max(reduced.shape[0], 2)), cv2.CV_32F)
-    return scipy.fft.rfft2(reduced * window)
+    return rfft2(reduced * window)
 
 
 def _peak(product: NDArray[np.complex64], shape: tuple[int, ...]) -> Shift:
     """Position (x, y) of the largest phase correlation, to a fraction of a pixel."""
     height, width = shape
-    y, x = scipy.fft.fftfreq(height)[:, None], scipy.fft.rfftfreq(width)[None]
+    y, x = np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None]
     blur = np.exp(-2 * np.pi**2 * _PEAK_WIDTH**2 * (x * x + y * y)).astype(np.float32)
     size = np.abs(product)
-    surface = scipy.fft.irfft2(product * (blur / (size + 1e-6 * size.max() + 1e-30)), s=(height, width))
+    surface = irfft2(product * (blur / (size + 1e-6 * size.max() + 1e-30)), (height, width))
     row, column = np.unravel_index(int(np.argmax(surface)), surface.shape)
     across = surface[row, [column - 1, column, (column + 1) % width]]
     down = surface[[row - 1, row, (row + 1) % height], column]
