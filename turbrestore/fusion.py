@@ -53,7 +53,16 @@ TileMap = Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]]
 # Files of floating point are taken for those of 16 bits.
 _MOST_BITS = 16
 # Figures of a filtered tile that are joined or averaged.
-_RECORDED = ("flow_states", "gains", "innovations", "sharpness", "shares", "image_noise", "sharpness_weight")
+_RECORDED = (
+    "flow_states",
+    "gains",
+    "innovations",
+    "sharpness",
+    "shares",
+    "image_noise",
+    "sharpness_weight",
+    "noise_gain",
+)
 
 # Stages that take a while and have no steps to count.
 _WITHOUT_STEPS = ("witnesses",)
@@ -343,6 +352,7 @@ def join_filtered(
         shares=average("shares"),
         image_noise=float(average("image_noise")),
         sharpness_weight=float(average("sharpness_weight")),
+        noise_gain=float(average("noise_gain")),
         mean_flow=mean_flow,
     )
 

@@ -26,7 +26,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .agreement.last_guard import halves_memory, keep_agreed_memory
+from .agreement.halves import halves_memory
+from .agreement.last_guard import keep_agreed_memory
 from .blind.remove_blur import SMALLEST_SIDE, remove_blur_memory
 from .core.decision import Decision
 from .core.errors import ConfigurationError, DataError, require

@@ -10,16 +10,20 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .agreement.last_guard import FEWEST, Halves, keep_agreed, registered_halves
+from .agreement.halves import HalvedClip, Halves, halve
+from .agreement.last_guard import Guarded, keep_agreed
 from .blind.remove_blur import SIGMAS_A_SIDE, Deblurred, remove_blur_steps
 from .blind.structure import compare_structure
 from .blur.measured_psf import psf_from_image
 from .blur.posterior import BlurWitnesses, measure_witnesses
+from .blur.psf import GAUSSIAN
 from .blur.witnesses.short_exposure import displacement_variance
 from .core.arrays import FloatArray, luminance
 from .core.decision import Decision
 from .core.errors import require
 from .core.noise import NoiseCurve, photon_noise
+from .core.noise_spectrum import NoiseSpectrum
+from .deconvolution.conjugate_gradient import wiener_filtered
 from .deconvolution.problem import read_blur
 from .dynamics.dynamic_texture import identify
 from .footage.checks.content import without_blank
@@ -40,7 +44,7 @@ from .results import Restoration, Store
 from .runtime.allocator import returning_freed_memory
 from .runtime.device import explain_device
 from .runtime.runtime import DEFAULT, Runtime
-from .runtime.scratch import iter_frames, mean_of
+from .runtime.scratch import iter_frames, mean_of, variance_of
 from .runtime.steps import Progress, finish
 from .seeing.displacement import LEAST_FRAMES
 from .seeing.strength import Seeing, seeing_of_picture
@@ -164,7 +168,7 @@ class _Evidence:
     saturation: float  # intensity from which the mean is saturated
     is_mean: bool = False  # whether the mean replaces the filtered image, which has structure that the frames lack
     witnesses: BlurWitnesses | None = None  # None if no blur is to be estimated
-    halves: Halves | None = None  # None then, and with few frames
+    halves: HalvedClip | None = None  # None then
 
 
 def _fuse(run: Run) -> tuple[Restoration, _Evidence]:
@@ -221,18 +225,28 @@ def _check_by_frames(
     if mean_flow.any():
         # The flows start from the geometry of the centroid.
         image = warp(image, invert_flow(recentring_flow(mean_flow)))
-    structure = compare_structure(image, training, flows)
+    halves = halve(training, flows, training.shape[1:], len(training), run.plan.runtime.threads)
+    new, lasting = halves.alternate.noise().deviation ** 2, halves.lasting.noise().deviation ** 2
+    structure = compare_structure(image, training, flows, len(training) * new, max(lasting - new, 0.0))
     run.decide(*explain_structure(structure))
-    if not structure.passed:
+    if not structure.explained:
         return replace(fused, image=fused.mean), _Evidence(saturation, is_mean=True)
     # No guard overrides a width that was asked for.
     if not run.params.finds_blur:
         return fused, _Evidence(saturation)
-    witnesses, halves = _find_witnesses(run, training, fused), None
-    if len(training) >= FEWEST:
-        found = registered_halves(training, flows, training.shape[1:], len(training), run.plan.runtime.threads)
-        halves = Halves(recentre(found.first, mean_flow), recentre(found.second, mean_flow))
+    halves = halves.recentred(mean_flow)
+    witnesses = replace(_find_witnesses(run, training, fused), noise=_fused_noise(fused, halves))
     return fused, _Evidence(saturation, False, witnesses, halves)
+
+
+def _fused_noise(fused: Restoration, halves: HalvedClip) -> NoiseSpectrum:
+    """Noise of the filtered image: that of the mean of the training frames, for as many frames as its weights leave."""
+    noise, filtered = halves.noise(), fused.filtered
+    if filtered is None:
+        return noise
+    # Σ / Z₀ is one over the number of frames that count.
+    counting = filtered.image_noise / max(float(filtered.variance.mean()), 1e-12)
+    return noise.scaled(halves.count / counting * filtered.noise_gain)
 
 
 def _deblur_and_crop(run: Run, fused: Restoration, evidence: _Evidence, psf: NDArray[np.float64] | None) -> Restoration:
@@ -240,12 +254,12 @@ def _deblur_and_crop(run: Run, fused: Restoration, evidence: _Evidence, psf: NDA
     params, image, halves = run.params, fused.image, evidence.halves
     deblurred, agreed = None, None
     if params.runs("deconvolve") and not evidence.is_mean:
-        photons = None if halves is None else _photon_noise(run, halves)
+        photons = None if halves is None else _photon_noise(run, halves.alternate)
         deblurred = run.stage("deconvolve", "deblurred", lambda: _remove_blur(run, fused, evidence, psf, photons))
         run.decide(*deblurred.decisions)
         image = deblurred.deconvolution.image
         if halves is not None:
-            agreed = keep_agreed(image, halves, run.prepared.levels.full_scale)
+            agreed = _keep_agreed(run, fused, deblurred, halves)
             run.decide(*agreed.decisions)
             image = agreed.image
     seen = coverage(fused.centroid.flows)
@@ -271,6 +285,22 @@ def _deblur_and_crop(run: Run, fused: Restoration, evidence: _Evidence, psf: NDA
         deconvolution=deblurred.deconvolution,
         guard_readings=deblurred.readings,
     )
+
+
+def _keep_agreed(run: Run, fused: Restoration, deblurred: Deblurred, halves: HalvedClip) -> Guarded:
+    """Compare the halves of the clip behind the deconvolution of the image, and keep what they agree on."""
+    done, posterior = deblurred.deconvolution, deblurred.posterior
+
+    def sharpened(half: FloatArray) -> FloatArray:
+        grey = luminance(half)
+        if done.sigma == 0:
+            return grey
+        return wiener_filtered(grey, done.sigma, GAUSSIAN if posterior is None else posterior.exponent, done.noise)
+
+    pairs = halves.alternate, halves.lasting
+    sharp = [Halves(sharpened(pair.first), sharpened(pair.second)) for pair in pairs]
+    mean = halves.alternate.mean
+    return keep_agreed(done.image, mean, halves.noise(), sharp, run.prepared.levels.full_scale)
 
 
 def _add_finer_grid(run: Run, restoration: Restoration) -> Restoration:
@@ -308,7 +338,9 @@ def _find_witnesses(run: Run, training: FloatArray, fused: Restoration) -> BlurW
             # Where no displacement can be measured, that of the flow is taken instead, less what the camera adds.
             variances = [np.square(flow - np.median(flow, axis=(0, 1))).mean() for flow in iter_frames(flows)]
             displacement, frames = float(np.mean(variances)), float(len(training))
-        return measure_witnesses(cropped, flows, _of_optics(BlurWitnesses(displacement, frames, picture), run, seeing))
+        error = float(np.sqrt(variance_of(flows).mean() / len(training)))
+        known = BlurWitnesses(displacement, frames, picture, position_error=error)
+        return measure_witnesses(cropped, flows, _of_optics(known, run, seeing))
 
 
 def _of_optics(known: BlurWitnesses, run: Run, seeing: Seeing | None) -> BlurWitnesses:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from .blind.structure import LEFT, UNSEEN, StructureReading
+from .blind.structure import LASTING, LEFT, UNSEEN, StructureReading
 from .core.arrays import FloatArray
 from .core.decision import Decision
 from .core.remarks import counted
@@ -130,9 +130,16 @@ def explain_geometry(filtered: Filtered, dynamics: FlowDynamics) -> Decision:
 
 
 def explain_structure(reading: StructureReading) -> tuple[Decision, ...]:
-    """Say that the filtered image is not the result, if it has edges that few frames have."""
-    if reading.passed:
+    """Say that the filtered image is not the result, if registration does not explain how the frames differ."""
+    if reading.explained:
         return ()
+    if reading.changes:
+        reason = (
+            f"registration leaves {reading.left:.0%} of the differences of the frames (bound {LEFT:.0%}), and "
+            f"{reading.lasting:.0%} of that lasts for half of the clip (bound {LASTING:.0%}): the scene itself changes; "
+            "use fewer frames (--frames 0:N), during which it does not"
+        )
+        return (Decision("structure", "the mean of the frames is the result", reason),)
     reason = (
         f"{reading.unseen:.0%} of the edges of the filtered image occur in fewer than half of the frames (bound "
         f"{UNSEEN:.0%}), and registration leaves {reading.left:.0%} of the differences of the frames (bound {LEFT:.0%})"

@@ -22,6 +22,7 @@ from ..blur.witnesses.image_evidence import image_evidence
 from ..core.arrays import FloatArray, check_image, luminance
 from ..core.decision import Decision
 from ..core.noise import NoiseCurve
+from ..core.noise_spectrum import NoiseSpectrum
 from ..deconvolution.deconvolve import Deconvolution, DeconvolutionParams, deconvolve_steps, whole_image_fidelity
 from ..deconvolution.memory import deconvolution_memory
 from ..deconvolution.problem import read_blur
@@ -100,11 +101,12 @@ def remove_blur_steps(
     else:
         sigma, params = posterior.removed, replace(params, exponent=params.exponent or posterior.exponent)
     size = image.shape[0], image.shape[1]
+    noise = None if witnesses is None else witnesses.noise
     in_tiles = () if side is None or find_device(runtime.device) != CPU else halo_tiles(size, side)
 
     def remove(width: float) -> Steps[Deconvolution]:
         kernel = width if psf is None or width == 0 else psf
-        return tiled_deconvolution_steps(image, kernel, params, guide, runtime, in_tiles, photons, full_scale)
+        return tiled_deconvolution_steps(image, kernel, params, guide, runtime, in_tiles, photons, full_scale, noise)
 
     blur_map, widths, first = None, None, None
     # The likelihood of a tile is unreliable where that of the image is, and where frames tell the blur they decide.
@@ -144,6 +146,7 @@ def tiled_deconvolution_steps(
     tiles: tuple[HaloTile, ...] = (),
     photons: NoiseCurve | None = None,
     full_scale: tuple[float, float] = (0.0, 1.0),
+    noise: NoiseSpectrum | None = None,
 ) -> Steps[Deconvolution]:
     """Deconvolve an image (H, W) or (H, W, 3) in overlapping tiles, by the blur and the fidelity λ of the whole.
 
@@ -153,17 +156,17 @@ def tiled_deconvolution_steps(
     pixels = check_image(image)
     guide_image = None if guide is None else check_image(guide, "guide")
     if not np.any(sigma) or len(tiles) < 2:
-        whole = yield from deconvolve_steps(pixels, sigma, params, guide_image, runtime, photons, full_scale)
+        whole = yield from deconvolve_steps(pixels, sigma, params, guide_image, runtime, photons, full_scale, noise)
         return replace(whole, image=to_scratch(whole.image, runtime.scratch))
     params = params or DeconvolutionParams()
     # Each tile chooses its own h for the nonlocal weights, from its guide after sharpening; that of the whole guide
     # before sharpening would be too small (0.3 dB worse on brick).
-    params = replace(params, fidelity=whole_image_fidelity(pixels, params))
+    params = replace(params, fidelity=whole_image_fidelity(pixels, params, read_blur(sigma)[1], noise))
     restored, parts = new_mosaic(pixels.shape, runtime.scratch), list[Deconvolution]()
     for tile in tiles:
         guide_part = None if guide_image is None else guide_image[tile.rows, tile.columns]
         cut = pixels[tile.rows, tile.columns]
-        part = yield from deconvolve_steps(cut, sigma, params, guide_part, runtime, photons, full_scale)
+        part = yield from deconvolve_steps(cut, sigma, params, guide_part, runtime, photons, full_scale, noise)
         add_tile(restored, tile, part.image)
         parts.append(replace(part, image=restored))
     noise = float(np.sqrt(np.mean([part.noise**2 for part in parts])))
@@ -270,11 +273,13 @@ def find_blur(
     grey = luminance(image)
     if witnesses.picture is not None:
         grey = np.ascontiguousarray(grey[witnesses.picture])
-    evidence = image_evidence(grey, runtime)
+    evidence = image_evidence(grey, runtime, witnesses.noise)
     ratio = None if witnesses.variation is None else witnesses.variation.with_power(grey)
     posterior = blur_posterior(evidence, witnesses, ratio)
     widest = min(WIDEST, min(grey.shape) / SIGMAS_A_SIDE)
-    posterior = replace(posterior, removed=min(posterior.removed, widest))
+    # What the mean geometry of few frames is off by blurs the expected image as a lens would, and stays.
+    sure = max(posterior.removed**2 - witnesses.position_error**2, 0.0) ** 0.5
+    posterior = replace(posterior, removed=min(sure, widest))
     if evidence is None:
         return estimate_blur(image, exponent=params.exponent, runtime=runtime), replace(posterior, removed=0.0)
     if posterior.removed == 0:

@@ -43,6 +43,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
+from ..core.noise_spectrum import NoiseSpectrum
 from .psf import Float64Array
 from .witnesses.hypotheses import LEAST_TRANSFER, Hypotheses, hypotheses, shapes
 from .witnesses.image_evidence import EXPONENTS, ImageEvidence
@@ -93,6 +94,9 @@ class BlurWitnesses:
     variation: SpectralVariation | None = None  # s and s_4, if they could be measured
     diffraction: float | None = None  # λ/D of known optics, pixels
     spread: float | None = None  # standard deviation of ln V, if V is what a measured D/r0 makes
+    noise: NoiseSpectrum | None = None  # of the fused image
+    # Standard error of the mean geometry along one axis if every frame were independent, pixels.
+    position_error: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

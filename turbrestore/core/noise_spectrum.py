@@ -67,7 +67,9 @@ def fit_noise_spectrum(differences: Iterable[FloatArray], scene: FloatArray) -> 
     of_scene = window_powers(scene)
     powers = [window_powers(difference) for difference in differences]
     # The lower quartile over the differences, because some may show what the others do not.
-    found = np.array([_fit_ring(ring, m) for ring, m in zip(np.quantile(powers, 0.25, axis=0).T, of_scene.T, strict=True)])
+    found = np.array(
+        [_fit_ring(ring, m) for ring, m in zip(np.quantile(powers, 0.25, axis=0).T, of_scene.T, strict=True)]
+    )
     # The mean of each window is taken out, which leaves half of the lowest ring.
     found[0] = found[1]
     return NoiseSpectrum(*np.maximum(found.T, [[_LEAST], [0], [0]]))

@@ -21,11 +21,11 @@ from typing import ClassVar, NamedTuple
 import cv2
 import numpy as np
 
-from ..blur.psf import laplacian_symbol
+from ..blur.psf import blur_otf, laplacian_symbol
 from ..core.arrays import FloatArray
-from ..core.noise import estimate_noise
+from ..runtime.fourier import irfft2, rfft2
 from ..runtime.image_stacks import Stack, load, namespace, store
-from .problem import Problem, total
+from .problem import MARGIN_SIGMAS, Problem, margin_around, total
 
 # A residual below this share of the energy of the data consists of rounding errors.
 ROUNDING = 1e-14
@@ -121,15 +121,22 @@ def wiener_fidelity(image: FloatArray, noise: float) -> float:
     return max(6.0 * float(deviation.item()) / float(np.hypot(noise, 0.002)), 1.0)
 
 
-def wiener_image(problem: Problem) -> Stack:
+def wiener_image(problem: Problem, noise: float) -> Stack:
     """Wiener solution (P, Q) that nltv and tv start from, with a fidelity of its own."""
-    observed = store(problem.observed)
-    problem = replace(problem, fidelity=wiener_fidelity(observed, estimate_noise(observed)))
+    problem = replace(problem, fidelity=wiener_fidelity(store(problem.observed), noise))
     solver = quadratic_solver(problem, "wiener")
     state = solver.start(problem)
     for _ in range(_START_STEPS):
         state = solver.step(problem, state)
     return state.image
+
+
+def wiener_filtered(image: FloatArray, sigma: float, exponent: float, noise: float) -> FloatArray:
+    """Wiener solution (H, W) for a blur of a given width and shape, as if the image went on by reflection."""
+    margin = margin_around((image.shape[0], image.shape[1]), int(np.ceil(MARGIN_SIGMAS * sigma)))
+    otf = blur_otf(margin.shape, sigma, exponent)
+    restored = otf / (otf**2 + laplacian_symbol(*margin.shape) / wiener_fidelity(image, noise))
+    return irfft2(rfft2(margin.pad(image)) * restored, margin.shape)[margin.inside()]
 
 
 def _inner(problem: Problem, a: Stack, b: Stack) -> float:

@@ -16,16 +16,18 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..blur.estimation import BlurEstimate
-from ..blur.psf import GAUSSIAN, blur_otf, check_exponent, psf_to_otf
+from ..blur.psf import GAUSSIAN, blur_otf, check_exponent, half_frequency, psf_to_otf
 from ..core.arrays import FloatArray, check_grey, check_image, luminance
 from ..core.errors import ConfigurationError, DataError, require, require_between
 from ..core.noise import NoiseCurve, estimate_noise
+from ..core.noise_spectrum import NoiseSpectrum
 from ..display.curves import plot_objective
 from ..display.preview import preview
 from ..runtime.device import find_device, memory_of
@@ -230,11 +232,12 @@ def deconvolve_steps(
     runtime: Runtime = DEFAULT,
     photons: NoiseCurve | None = None,
     full_scale: tuple[float, float] = (0.0, 1.0),
+    spectrum: NoiseSpectrum | None = None,
 ) -> Steps[Deconvolution]:
     """Deblur an image step by step; arguments, errors and result as of :func:`deconvolve`.
 
     ``photons`` is the noise of the image at every level, relative to its mean; ``full_scale`` is black and white, to
-    which the result is clipped.
+    which the result is clipped; ``spectrum`` is the noise of the luminance, if the frames have told it.
     """
     params = params or DeconvolutionParams()
     pixels = check_image(image)
@@ -247,7 +250,7 @@ def deconvolve_steps(
         sigma_or_psf = sigma_or_psf.removable
     psf, sigma, reach = read_blur(sigma_or_psf)
     planes = split_planes(pixels, params.channels)
-    noise, fidelity = _noise_and_fidelity(planes, params)
+    noise, fidelity = _noise_and_fidelity(planes, params, sigma, spectrum)
     if sigma == 0:
         nothing = np.zeros(0)
         return Deconvolution(pixels, 0.0, fidelity, noise, 0, True, nothing.astype(np.int64), nothing, nothing)
@@ -268,7 +271,7 @@ def deconvolve_steps(
             if grey.shape != margin.size:
                 raise DataError(f"guide: expected the size of the image {margin.size}, found {grey.shape}")
             guide_image = margin.pad(grey)
-        solution = yield from _solve(problems, guide_image, measured, params, team)
+        solution = yield from _solve(problems, guide_image, noise, measured, params, team)
     restored = join_planes(pixels, [store(u)[margin.inside()] for u in solution.images], params.channels)
     records = (np.array(column) for column in zip(*solution.records, strict=True))
     return Deconvolution(
@@ -276,10 +279,11 @@ def deconvolve_steps(
     )
 
 
-def whole_image_fidelity(image: ArrayLike, params: DeconvolutionParams | None = None) -> float:
+def whole_image_fidelity(
+    image: ArrayLike, params: DeconvolutionParams, sigma: float, spectrum: NoiseSpectrum | None
+) -> float:
     """Weight λ of the data for an image (H, W[, 3]), so that its tiles can have the same."""
-    params = params or DeconvolutionParams()
-    return _noise_and_fidelity(split_planes(check_image(image), params.channels), params)[1]
+    return _noise_and_fidelity(split_planes(check_image(image), params.channels), params, sigma, spectrum)[1]
 
 
 def split_planes(image: FloatArray, channels: str) -> list[FloatArray]:
@@ -299,13 +303,18 @@ def join_planes(image: FloatArray, planes: list[FloatArray], channels: str) -> F
 
 
 def _solve(
-    problems: list[Problem], guide: FloatArray | None, measured: Stack, params: DeconvolutionParams, team: ThreadTeam
+    problems: list[Problem],
+    guide: FloatArray | None,
+    noise: float,
+    measured: Stack,
+    params: DeconvolutionParams,
+    team: ThreadTeam,
 ) -> Steps[Solution]:
     stop = measured, params.iterations, params.tolerance
     if params.method in ("wiener", "tikhonov"):
         quadratic = quadratic_solver(problems[0], params.method)
         return (yield from iterate(quadratic, problems, [quadratic.start(p) for p in problems], *stop))
-    starts, compared = _sharpened(problems, guide, params, team)
+    starts, compared = _sharpened(problems, guide, noise, params, team)
     penalty: Penalty = LocalPenalty()
     if params.method == "nltv" and isinstance(measured, np.ndarray):
         penalty = NonlocalPenalty(nonlocal_weights(compared, params.weights, problems[0].threads), team)
@@ -318,14 +327,15 @@ def _solve(
 
 
 def _sharpened(
-    problems: list[Problem], guide: FloatArray | None, params: DeconvolutionParams, team: ThreadTeam
+    problems: list[Problem], guide: FloatArray | None, noise: float, params: DeconvolutionParams, team: ThreadTeam
 ) -> tuple[list[Stack], FloatArray]:
     """Return the Wiener solutions to start from, and the image for patches, by default the mean of the channels."""
     observed, blurred = problems[0].observed, list(problems)
     if guide is not None and params.sharpen_guide and params.method == "nltv":
         blurred.append(dataclasses.replace(problems[0], observed=load(guide, observed.device)))
     side_by_side = isinstance(observed, np.ndarray) and observed.size >= _PARALLEL_PIXELS
-    sharp = list(team.map(wiener_image, blurred) if side_by_side else map(wiener_image, blurred))
+    sharpen = partial(wiener_image, noise=noise)
+    sharp = list(team.map(sharpen, blurred) if side_by_side else map(sharpen, blurred))
     starts, further = sharp[: len(problems)], sharp[len(problems) :]
     if further:
         return starts, store(further[0])
@@ -335,8 +345,14 @@ def _sharpened(
     return starts, np.mean([store(u) for u in own], axis=0, dtype=np.float32)
 
 
-def _noise_and_fidelity(planes: list[FloatArray], params: DeconvolutionParams) -> tuple[float, float]:
-    noise = float(np.sqrt(np.mean([estimate_noise(plane) ** 2 for plane in planes])))
+def _noise_and_fidelity(
+    planes: list[FloatArray], params: DeconvolutionParams, sigma: float, spectrum: NoiseSpectrum | None
+) -> tuple[float, float]:
+    """Noise that the deconvolution meets, and λ: of smooth noise, what there is where the blur passes one half."""
+    if spectrum is None:
+        noise = float(np.sqrt(np.mean([estimate_noise(plane) ** 2 for plane in planes])))
+    else:
+        noise = spectrum.deviation if sigma == 0 else float(spectrum.at(np.array(half_frequency(sigma))) ** 0.5)
     return noise, params.fidelity or automatic_fidelity(params.method, planes[0], noise)
 
 

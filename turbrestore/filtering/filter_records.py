@@ -148,6 +148,8 @@ class Filtered:
         Z₀, squared intensity.
     sharpness_weight : float
         β, given or chosen.
+    noise_gain : float
+        Variance of the noise of the image, relative to that with equal weights.
     mean_flow : ndarray, float32, shape (H, W, 2)
         Mean of W^meas over all frames that count, less that over the frames with known flows, pixels: how far the
         centroid of those, in whose geometry frames are fused, lies from the mean geometry of all frames.  Both means
@@ -164,6 +166,7 @@ class Filtered:
     shares: np.ndarray
     image_noise: float
     sharpness_weight: float
+    noise_gain: float
     mean_flow: FloatArray
 
     def recentred(self) -> Filtered:

@@ -76,8 +76,10 @@ def pass_over(
     With ``image`` None the known flows are taken as measured.  ``image`` (H, W) or (H, W, 3).
     """
     dynamics, on_cpu = settings.dynamics, settings.runtime.device == CPU
-    reference = None if image is None else prepare_reference(
-        image, settings.flow_params, settings.runtime, settings.statistics.frame_noise
+    reference = (
+        None
+        if image is None
+        else prepare_reference(image, settings.flow_params, settings.runtime, settings.statistics.frame_noise)
     )
     size, threads = (1, settings.runtime.threads) if reference is None else (reference.batch, reference.threads)
 

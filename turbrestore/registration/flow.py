@@ -252,7 +252,10 @@ def prepare_reference(
         if refine is not None and not draft:
             flows = [refine(*moved) for moved in zip(placed, flows, strict=True)]
         if confidence is not None:
-            flows = [regularise_flow(f, confidence, max(frame.noise, least_noise)) for f, frame in zip(flows, batch, strict=True)]
+            flows = [
+                regularise_flow(f, confidence, max(frame.noise, least_noise))
+                for f, frame in zip(flows, batch, strict=True)
+            ]
         return [flow + shift if shift.any() else flow for flow, shift in zip(flows, shifts, strict=True)]
 
     # A device solves a batch at once while others are prepared; on the CPU every frame has a thread.

@@ -30,10 +30,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..agreement.last_guard import Halves, keep_agreed
+from ..agreement.halves import Halves
+from ..agreement.last_guard import keep_agreed
 from ..blind.remove_blur import guarded_steps
 from ..blur.psf import GAUSSIAN, blur_otf
-from ..core.arrays import FloatArray
+from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..deconvolution.deconvolve import Deconvolution, deconvolve_steps
 from ..deconvolution.stopping import Steps
@@ -67,13 +68,14 @@ def fine_image(
     counts = np.ones(restoration.frame_count) if filtered is None else filtered.shares * restoration.frame_count
     flows = registering_flows(prepared.source, restoration, restoration.centroid.image, params, runtime)
     halves = fuse_finely(flows, counts, prepared.source.shape[1:], scale, runtime.threads)
-    image = (halves.first + halves.second) / np.float32(2)
+    image = halves.mean
     if done is None:
         choice, reason = f"{scale:g} times as fine, blurred", "no blur is removed before the last stage"
         return image, Decision("scale", choice, reason)
     removed = _removed(image, done.sigma, params, restoration, runtime, full_scale)
     sharp = np.clip(_with_usual(removed.image, done.image, done.sigma), *full_scale)
-    agreed = keep_agreed(sharp, halves, full_scale)
+    compared = Halves(luminance(halves.first), luminance(halves.second))
+    agreed = keep_agreed(sharp, image, halves.noise(), [compared], full_scale)
     choice = f"{scale:g} times as fine, with {removed.sigma:.2f} fine pixels of blur and the pixel removed"
     reason = f"{restoration.motion:.2f} pixels of motion place {restoration.frame_count} frames between its pixels"
     return agreed.image, Decision("scale", choice, reason)

@@ -42,7 +42,6 @@ from ..blind.remove_blur import Deblurred
 from ..blur.psf import GAUSSIAN, blur_otf, laplacian_symbol
 from ..core.arrays import FloatArray, luminance
 from ..core.gradient import sobel_gradient
-from ..core.noise import estimate_noise
 from ..deconvolution.conjugate_gradient import wiener_fidelity
 from ..deconvolution.deconvolve import DeconvolutionParams, automatic_fidelity
 from ..deconvolution.problem import MARGIN_SIGMAS, margin_around
@@ -76,7 +75,7 @@ def measure_deviation(
     if deblurred is not None:
         done, posterior = deblurred.deconvolution, deblurred.posterior
         blur, exponent = posterior or deblurred.blur, params.exponent
-        fidelity = quadratic_fidelity(filtered.image, params.method, done.fidelity)
+        fidelity = quadratic_fidelity(filtered.image, params.method, done.fidelity, done.noise)
         exponent = blur.exponent if exponent is None and blur is not None else exponent
         gain = posterior_gain((image.shape[0], image.shape[1]), fidelity, done.sigma, exponent)
         if posterior is not None:
@@ -129,15 +128,14 @@ def variance_by_blur(fused: FloatArray, fidelity: float, widths: tuple[float, fl
     return cv2.GaussianBlur(np.square(between).astype(np.float32), (0, 0), _WINDOW)
 
 
-def quadratic_fidelity(fused: FloatArray, method: str, fidelity: float) -> float:
+def quadratic_fidelity(fused: FloatArray, method: str, fidelity: float, noise: float) -> float:
     """Return the weight λ with which a quadratic prior approximates that of a deconvolution.
 
     It is the automatic weight for wiener, times the ratio of the weight that was used to the automatic one; for wiener
     this is the weight that was used.
-    ``fused`` (H, W) or (H, W, 3).
+    ``fused`` (H, W) or (H, W, 3), with noise of the deviation ``noise``.
     """
     grey = luminance(fused)
-    noise = estimate_noise(grey)
     return wiener_fidelity(grey, noise) * fidelity / automatic_fidelity(method, grey, noise)
 
 
