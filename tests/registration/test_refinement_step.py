@@ -48,7 +48,7 @@ def test_one_step_is_least_squares_in_the_window(monkeypatch):
     found = flow_refinement(reference)(frame, start)
     g = np.stack([cv2.Scharr(np.float64(reference), -1, *axis) / 32 for axis in ((1, 0), (0, 1))], -1)
     e = warp(frame.astype(np.float32), start, "linear") - reference.astype(np.float64)
-    kernel = cv2.getGaussianKernel(round(8 * 2.0 + 1) | 1, 2.0).ravel()
+    kernel = cv2.getGaussianKernel(round(8 * 3.0 + 1) | 1, 3.0).ravel()
     half = len(kernel) // 2
     for row, column in ((20, 20), (14, 25)):
         part = np.s_[row - half : row + half + 1, column - half : column + half + 1]
