@@ -34,8 +34,8 @@ from ..runtime.jit import jit
 GreyImage = NDArray[np.uint8]
 # Takes a frame (H, W) and a flow to it (H, W, 2); returns the refined flow.
 RefineFlow = Callable[[GreyImage, FloatArray], FloatArray]
-# Standard deviation of the window, pixels: that in which the texture is told to determine the flow.
-_WINDOW = 2.0
+# Standard deviation of the window, pixels: narrower ones follow noise and what a blurred reference lacks.
+_WINDOW = 3.0
 # ε, squared grey levels per squared pixel: below one grey level a pixel, a gradient is rounding.
 _LEAST_TEXTURE = 1.0
 _STEPS = 2
