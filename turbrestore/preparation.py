@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .agreement.sensor_pattern import without_stripes
 from .core.decision import Decision
 from .core.remarks import Doubt
 from .footage.background import without_moving_objects
@@ -18,6 +17,7 @@ from .footage.levels import Levels, stretch_levels
 from .footage.lighting.light import steady_light
 from .footage.lighting.white_balance import steady_white_balance
 from .footage.overlays import Title, read_static_mask, without_overlay
+from .footage.sensor_pattern import without_stripes
 from .footage.survey import measure_moments, take_survey
 from .io.source import FrameSource, Window
 from .results import Restoration, at_levels_of_clip
