@@ -4,33 +4,31 @@ Symbols
 -------
 P : offset of every pixel, in each segment of the clip; m : mean of the frames
 v : half of the mean squared difference from one frame to the next, to which P adds nothing; n² its median
-s : motion of the edges of the scene, pixels
-S : mean of the registered frames; d : displacement of a frame
+s : motion of the scene, pixels
 
-The air moves the scene by s, so that m shows little of it that is finer than s; P stays and is as fine as a pixel.
-The high frequencies of m are P where they are far stronger than the noise of m, which is at most n² over the number of
-frames, and where they do not add to v, as s² times the squared slope of what moves would.  Ordinary clips are told apart
-by these two figures of m and v, which the survey has.  The frames without a first P, the high frequencies of the mean
-of each segment, are registered, and ``P = mean of (frame − S ∘ d)`` over each segment is free of the scene.
+The air moves the scene by s, so that little of it in m is finer than s; P stays, and is as fine as a pixel.  The fine
+detail of m belongs to the sensor where it is far stronger than the noise of m, which is at most n² over the number of
+frames, and where it does not add to v, as detail that moves would, by s² times its squared slope.  The survey has m
+and v, so clips without a pattern are told at no cost.
+
+P is white, and the scene fades towards high frequencies.  Wiener's filter therefore finds P in the mean of the frames
+of a segment: at each frequency, P has the power of the highest frequencies, and the scene has the rest.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..core.gradient import sobel_gradient
 from ..io.source import Window
-from ..registration.flow import MIN_SIDE, iterate_flows
-from ..registration.flow_algebra import invert_flow
-from ..registration.warp import inside, warp
 from .placement import relative_window
 from .survey import Moments, Survey
 
@@ -41,15 +39,15 @@ class _Limits:
 
     frames: int = 8  # fewest frames, as for stripes of the sensor
     motion: float = 0.3  # least s, pixels, as for stripes of the sensor
-    # Least deviation of P in those of the noise of m.  Forty clips without a pattern reach 1.7, and thermal ones have 11.
+    # Least deviation of fine detail of m in that of its noise.  Sixty clips without a pattern reach 1.7, patterns 11.
     clear: float = 4.0
-    # Most that P adds to v, relative to what moves.  Clips without a pattern have more, or less than nothing.
-    static: float = 0.25
-    outlier: float = 5.0  # deviations of P beyond which a pixel is an overlay or an object; normal ones stay below 4.5
-    blur: float = 1.5  # deviation of the Gaussian that splits off the high frequencies, in units of s
+    static: float = 0.25  # most that P adds to v, relative to what would move, as for stripes of the sensor
+    steep: float = 0.9  # quantile of the slopes from which s is measured
+    outlier: float = 5.0  # deviations of P beyond which a pixel is of an overlay or an object; normal ones stay below 4.5
+    high: float = 0.25  # cycles per pixel from which frequencies are high: half of the range
     window: int = 4  # frames before and after a cut that are compared
     changed: float = 2.0  # least change of P at a cut, as a variance relative to what frames differ by elsewhere
-    pixels: int = 1 << 16  # about how many pixels are compared for cuts
+    pixels: int = 1 << 16  # about how many pixels are compared at cuts
 
 
 _LIMITS = _Limits()
@@ -65,12 +63,7 @@ class PixelPattern:
 
     def without(self, number: int, values: FloatArray, window: Window) -> FloatArray:
         """Subtract the pattern from a frame, or from a window of it."""
-        part = relative_window(self.window, window)
-        return values - self.offsets[self.segment(number)][part]
-
-    def segment(self, number: int) -> int:
-        """Return the segment of a frame."""
-        return max(bisect_right(self.starts, number) - 1, 0)
+        return values - self.offsets[_segment(self.starts, number)][relative_window(self.window, window)]
 
 
 def without_pixel_pattern(survey: Survey, moments: Moments) -> tuple[Survey, tuple[Decision, ...]]:
@@ -78,162 +71,118 @@ def without_pixel_pattern(survey: Survey, moments: Moments) -> tuple[Survey, tup
     motion = _motion_beside_pattern(moments)
     if motion is None:
         return survey, ()
-    flat = _flat(moments)
-    starts = _segment_starts(survey, flat, motion)
-    draft = _draft_pattern(survey, starts, motion)
-    found = _registered_pattern(survey, draft)
-    size = float(np.sqrt(np.mean(found.offsets**2)))
-    if not size:
-        return survey, ()
+    starts = _segment_starts(survey, moments)
+    offsets = np.stack([_white_part(mean) for mean in _means_of_segments(survey, starts)])
+    # Where nothing moves, nobody can tell the offsets from the scene.
+    offsets *= motion if offsets.ndim == 3 else motion[..., None]
+    pattern = PixelPattern(starts, offsets, survey.clip.window)
     changes = "" if len(starts) == 1 else f", which change at frame {', '.join(map(str, starts[1:]))},"
-    choice = f"offsets of single pixels{changes} subtracted, {100 * size:.2g} % of full scale"
+    size = 100 * float(np.sqrt(np.mean(np.square(offsets))))
+    choice = f"offsets of single pixels{changes} subtracted: {size:.2g} % of full scale"
     decision = Decision("sensor", choice, "they are static while the air moves the scene")
-    return survey.adjusted(found.without), (decision,)
+    return survey.adjusted(pattern.without), (decision,)
 
 
-def _flat(moments: Moments) -> NDArray[np.bool_]:
-    """Mark the flatter half of the picture."""
-    slopes = _squared_slope(cv2.GaussianBlur(luminance(moments.mean), (0, 0), 1.0))
-    return np.asarray(slopes <= np.median(slopes))
-
-
-def _motion_beside_pattern(moments: Moments) -> float | None:
-    """Return s where the fine detail of the mean belongs to the sensor, and None where it need not."""
+def _motion_beside_pattern(moments: Moments) -> NDArray[np.bool_] | None:
+    """Mark, (H, W), where the scene moves, if the fine detail of the mean belongs to the sensor; else return None."""
     mean, change = luminance(moments.mean), moments.change
-    if moments.count < _LIMITS.frames or min(mean.shape) < MIN_SIDE:
+    if moments.count < _LIMITS.frames:
         return None
-    noise, slopes = float(np.median(change)), _squared_slope(cv2.GaussianBlur(mean, (0, 0), 1.0))
-    edges = slopes > np.quantile(slopes, 0.9)
+    noise, slopes = float(np.median(change)), _squared_slope(cv2.GaussianBlur(mean, (0, 0), 2.0))
+    edges = slopes > np.quantile(slopes, _LIMITS.steep)
     if not edges.any():
         return None
-    motion = float(np.sqrt(np.median(np.maximum(change[edges] - noise, 0) / slopes[edges])))
+    moved = np.maximum(change - np.float32(noise), 0)
+    motion = float(np.sqrt(np.median(moved[edges] / slopes[edges])))
     if motion < _LIMITS.motion:
         return None
-    fine = _fine(mean, motion)
-    usual = _flat(moments) & _inliers(fine)
-    if np.mean(fine[usual] ** 2) < _LIMITS.clear**2 * noise / moments.count:
+    fine = mean - cv2.GaussianBlur(mean, (0, 0), max(motion, 1))
+    usual = (slopes <= np.median(slopes)) & _usual(fine)
+    if not usual.any() or np.mean(fine[usual] ** 2) < _LIMITS.clear**2 * noise / moments.count:
         return None
-    slope = _squared_slope(fine)[usual]
-    gained = float(np.mean((slope - slope.mean()) * (change[usual] - change[usual].mean()))) / float(slope.var())
-    return motion if abs(gained) < _LIMITS.static * motion**2 else None
+    slope, flicker = _squared_slope(fine)[usual], change[usual]
+    gained = float(np.mean((slope - slope.mean()) * (flicker - flicker.mean()))) / max(float(slope.var()), 1e-24)
+    if abs(gained) > _LIMITS.static * motion**2:
+        return None
+    # Edges are few, so that motion is known only over wide windows.
+    width = min(mean.shape) / 8
+    moved, slopes = (cv2.GaussianBlur(some * edges, (0, 0), width) for some in (moved, slopes))
+    return np.asarray(moved >= _LIMITS.motion**2 * slopes)
 
 
-def _segment_starts(survey: Survey, flat: NDArray[np.bool_], motion: float) -> tuple[int, ...]:
+def _segment_starts(survey: Survey, moments: Moments) -> tuple[int, ...]:
     """Find where the pattern changes: the means of a few frames before and after differ more than elsewhere."""
-    places = np.flatnonzero(flat)[:: max(np.count_nonzero(flat) // _LIMITS.pixels, 1)]
-    fine = np.stack([_fine(luminance(frame), motion).ravel()[places] for frame in survey])
+    slopes = _squared_slope(cv2.GaussianBlur(luminance(moments.mean), (0, 0), 2.0))
+    flat = np.flatnonzero(slopes <= np.median(slopes))
+    places = flat[:: max(len(flat) // _LIMITS.pixels, 1)]
+    fine = np.stack([_fine_detail(frame, places) for frame in survey])
     changes = np.zeros(len(fine))
     for cut in range(1, len(fine)):
         before, after = fine[max(cut - _LIMITS.window, 0) : cut], fine[cut : cut + _LIMITS.window]
         difference = np.square(before.mean(axis=0) - after.mean(axis=0)).mean()
         changes[cut] = difference / (1 / len(before) + 1 / len(after))
-    usual, cuts = float(np.median(changes[1:])), list[int]()
-    for cut in range(1, len(fine)):
-        near = changes[max(cut - _LIMITS.window, 0) : cut + _LIMITS.window + 1]
-        if changes[cut] == near.max() and changes[cut] > _LIMITS.changed * usual:
-            cuts.append(cut)
-    return (survey.clip.numbers[0], *(_first_after(survey, fine, places, motion, cut) for cut in cuts))
+    least = _LIMITS.changed * float(np.median(changes[1:]))
+    starts = [survey.clip.numbers[0]]
+    for cut in np.flatnonzero(changes > least):
+        if changes[cut] == changes[max(cut - _LIMITS.window, 0) : cut + _LIMITS.window + 1].max():
+            starts.append(_first_after(survey, fine, places, int(cut)))
+    return tuple(starts)
 
 
-def _first_after(survey: Survey, fine: FloatArray, places: NDArray[np.int64], motion: float, cut: int) -> int:
+def _first_after(survey: Survey, fine: FloatArray, places: NDArray[np.int64], cut: int) -> int:
     """Number of the first frame that has the pattern after a cut; frames between those of the survey are read."""
     last, first = survey.numbers[cut - 1], survey.numbers[cut]
     between = tuple(number for number in survey.clip.numbers if last < number < first)
-    before, after = (part.mean(axis=0) for part in (fine[max(cut - _LIMITS.window, 0) : cut], fine[cut:][:_LIMITS.window]))
+    before, after = fine[max(cut - _LIMITS.window, 0) : cut].mean(axis=0), fine[cut:][: _LIMITS.window].mean(axis=0)
     for number, frame in zip(between, replace(survey.clip, numbers=between) if between else (), strict=True):
-        values = _fine(luminance(frame), motion).ravel()[places]
+        values = _fine_detail(frame, places)
         if np.square(values - after).sum() < np.square(values - before).sum():
             return number
     return first
 
 
-def _draft_pattern(survey: Survey, starts: tuple[int, ...], motion: float) -> PixelPattern:
-    """Take the high frequencies of the mean of each segment, in which fine detail of the scene is blurred by motion."""
-    none = PixelPattern(starts, np.zeros((len(starts), *survey.clip.shape[1:]), np.float32), survey.clip.window)
-    means = _means_of_segments(none, survey.numbers, survey)[0].mean(axis=0)
-    return replace(none, offsets=np.stack([_without_outliers(_fine(mean, motion)) for mean in means]))
+def _fine_detail(frame: FloatArray, places: NDArray[np.int64]) -> FloatArray:
+    grey = luminance(frame)
+    return (grey - cv2.GaussianBlur(grey, (0, 0), 1.0)).ravel()[places]
 
 
-def _registered_pattern(survey: Survey, draft: PixelPattern) -> PixelPattern:
-    """Take the mean, over each segment, of what is left of frames without the registered scene.
-
-    Where nothing moves, offsets and scene cannot be told apart, and the offsets are 0.  They are drawn towards 0 by the
-    share that two halves of the frames of a segment do not have in common.
-    """
-    numbers, window = survey.numbers, survey.clip.window
-
-    def cleaned() -> Iterator[FloatArray]:
-        return (draft.without(number, frame, window) for number, frame in zip(numbers, survey, strict=True))
-
-    mean = _mean_of(cleaned())
-    total, weight = 1e-3 * mean.astype(np.float64), np.full(mean.shape[:2], 1e-3)
-    for frame, flow in iterate_flows(mean, cleaned()):
-        seen = inside(flow)
-        total += (warp(frame, flow).T * seen.T).T
-        weight += seen
-    scene = (total.T / weight.T).T.astype(np.float32)
-    moved = np.zeros((2, *mean.shape[:2], 2))
-
-    def residuals() -> Iterator[FloatArray]:
-        for (_, flow), frame in zip(iterate_flows(scene, cleaned()), survey, strict=True):
-            moved[0] += flow
-            moved[1] += np.square(flow)
-            yield frame - warp(scene, invert_flow(flow))
-
-    halves, counts = _means_of_segments(draft, numbers, residuals())
-    average, square = moved / len(numbers)
-    moves = np.sum(square - average**2, axis=-1) / 2 >= _LIMITS.motion**2
-    offsets = [
-        _shared(first, second, moves) if count >= 2 else np.zeros_like(first)
-        for first, second, count in zip(*halves, counts, strict=True)
-    ]
-    return replace(draft, offsets=np.stack(offsets))
+def _means_of_segments(survey: Survey, starts: tuple[int, ...]) -> FloatArray:
+    """Means of the whole frames of each segment, (K, H, W) or (K, H, W, 3)."""
+    totals, counts = np.zeros((len(starts), *survey.clip.shape[1:]), np.float32), np.zeros(len(starts), np.float32)
+    for number, frame in zip(survey.numbers, survey, strict=True):
+        cv2.accumulate(frame, totals[_segment(starts, number)])
+        counts[_segment(starts, number)] += 1
+    return (totals.T / counts).T
 
 
-def _means_of_segments(
-    pattern: PixelPattern, numbers: Iterable[int], frames: Iterable[FloatArray]
-) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Means of every other frame, (2, K, H, W[, 3]), and the number of frames of each segment."""
-    totals = np.zeros((2, *pattern.offsets.shape), np.float32)
-    counts = np.zeros((2, len(pattern.starts)), np.int64)
-    for number, frame in zip(numbers, frames, strict=True):
-        segment = pattern.segment(number)
-        half = counts[:, segment].sum() % 2
-        totals[half, segment] += frame
-        counts[half, segment] += 1
-    means = (totals.T / np.maximum(counts, 1, dtype=np.float32).T).T
-    # The only frame of a segment stands for both halves.
-    means[1, counts[1] == 0] = means[0, counts[1] == 0]
-    return means, counts.sum(axis=0)
+def _segment(starts: tuple[int, ...], number: int) -> int:
+    return max(bisect_right(starts, number) - 1, 0)
 
 
-def _shared(first: FloatArray, second: FloatArray, moves: NDArray[np.bool_]) -> FloatArray:
-    """Average two estimates of the offsets, weighted by what they have in common."""
-    offsets = _without_outliers((first + second) / 2)
-    offsets *= moves if offsets.ndim == 2 else moves[..., None]
-    used = offsets != 0
-    alike = float(np.corrcoef(first[used], second[used])[0, 1]) if used.any() else 0.0
-    # The reliability of the mean of two measurements (Spearman and Brown).
-    return offsets * np.float32(max(2 * alike / (1 + alike), 0))
+def _white_part(image: FloatArray) -> FloatArray:
+    """Filter a mean (H, W) or (H, W, 3) by Wiener's filter for white noise of the power of the highest frequencies."""
+    if image.ndim == 3:
+        return np.stack([_white_part(image[..., channel]) for channel in range(3)], axis=-1)
+    # The cosine transform continues an image by its reflection, and keeps white noise white.
+    spectrum = scipy.fft.dctn(image, norm="ortho")
+    height, width = image.shape
+    frequency = np.hypot(np.arange(height)[:, None] / (2 * height), np.arange(width) / (2 * width))
+    high = frequency >= _LIMITS.high
+    fine = scipy.fft.idctn(spectrum * high, norm="ortho")
+    white = _deviation(fine) ** 2 / high.mean()
+    rings = (frequency * min(height, width) / 4).astype(np.int64)
+    power = np.bincount(rings.ravel(), np.square(spectrum, dtype=np.float64).ravel()) / np.bincount(rings.ravel())
+    share = np.minimum(white / np.maximum(power, 1e-24), 1).astype(np.float32)
+    offsets = scipy.fft.idctn(spectrum * share[rings], norm="ortho")
+    return np.asarray(offsets * _usual(offsets), np.float32)
 
 
-def _mean_of(frames: Iterable[FloatArray]) -> FloatArray:
-    total, count = np.float64(0), 0
-    for frame in frames:
-        total, count = total + frame, count + 1
-    return np.asarray(total / count, np.float32)
+def _usual(fine: FloatArray) -> NDArray[np.bool_]:
+    return np.asarray(np.abs(fine) < _LIMITS.outlier * _deviation(fine))
 
 
-def _fine(image: FloatArray, motion: float) -> FloatArray:
-    return image - cv2.GaussianBlur(image, (0, 0), max(_LIMITS.blur * motion, 1))
-
-
-def _inliers(fine: FloatArray) -> NDArray[np.bool_]:
-    return np.asarray(np.abs(fine) < _LIMITS.outlier * 1.4826 * np.median(np.abs(fine)))
-
-
-def _without_outliers(offsets: FloatArray) -> FloatArray:
-    return offsets * _inliers(offsets - np.median(offsets))
+def _deviation(fine: FloatArray) -> float:
+    return 1.4826 * float(np.median(np.abs(fine)))
 
 
 def _squared_slope(image: FloatArray) -> FloatArray:
