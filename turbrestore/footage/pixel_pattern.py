@@ -43,7 +43,9 @@ class _Limits:
     clear: float = 4.0
     static: float = 0.25  # most that P adds to v, relative to what would move, as for stripes of the sensor
     steep: float = 0.9  # quantile of the slopes from which s is measured
-    outlier: float = 5.0  # deviations of P beyond which a pixel is of an overlay or an object; normal ones stay below 4.5
+    outlier: float = (
+        5.0  # deviations of P beyond which a pixel is of an overlay; white noise reaches 4.5
+    )
     high: float = 0.25  # cycles per pixel from which frequencies are high: half of the range
     window: int = 4  # frames before and after a cut that are compared
     changed: float = 2.0  # least change of P at a cut, as a variance relative to what frames differ by elsewhere
@@ -130,7 +132,7 @@ def _segment_starts(survey: Survey, moments: Moments) -> tuple[int, ...]:
 
 
 def _first_after(survey: Survey, fine: FloatArray, places: NDArray[np.int64], cut: int) -> int:
-    """Number of the first frame that has the pattern after a cut; frames between those of the survey are read."""
+    """Return the first frame that has the pattern after a cut; frames between those of the survey are read."""
     last, first = survey.numbers[cut - 1], survey.numbers[cut]
     between = tuple(number for number in survey.clip.numbers if last < number < first)
     before, after = fine[max(cut - _LIMITS.window, 0) : cut].mean(axis=0), fine[cut:][: _LIMITS.window].mean(axis=0)
