@@ -43,9 +43,7 @@ class _Limits:
     clear: float = 4.0
     static: float = 0.25  # most that P adds to v, relative to what would move, as for stripes of the sensor
     steep: float = 0.9  # quantile of the slopes from which s is measured
-    outlier: float = (
-        5.0  # deviations of P beyond which a pixel is of an overlay; white noise reaches 4.5
-    )
+    outlier: float = 5.0  # deviations of P beyond which a pixel is of an overlay; white noise reaches 4.5
     high: float = 0.25  # cycles per pixel from which frequencies are high: half of the range
     window: int = 4  # frames before and after a cut that are compared
     changed: float = 2.0  # least change of P at a cut, as a variance relative to what frames differ by elsewhere
@@ -107,8 +105,7 @@ def _motion_beside_pattern(moments: Moments) -> NDArray[np.bool_] | None:
     if abs(gained) > _LIMITS.static * motion**2:
         return None
     # Edges are few, so that motion is known only over wide windows.
-    width = min(mean.shape) / 8
-    moved, slopes = (cv2.GaussianBlur(some * edges, (0, 0), width) for some in (moved, slopes))
+    moved, slopes = (cv2.GaussianBlur(some * edges, (0, 0), min(mean.shape) / 8) for some in (moved, slopes))
     return np.asarray(moved >= _LIMITS.motion**2 * slopes)
 
 
@@ -125,9 +122,9 @@ def _segment_starts(survey: Survey, moments: Moments) -> tuple[int, ...]:
         changes[cut] = difference / (1 / len(before) + 1 / len(after))
     least = _LIMITS.changed * float(np.median(changes[1:]))
     starts = [survey.clip.numbers[0]]
-    for cut in np.flatnonzero(changes > least):
+    for cut in np.flatnonzero(changes > least).tolist():
         if changes[cut] == changes[max(cut - _LIMITS.window, 0) : cut + _LIMITS.window + 1].max():
-            starts.append(_first_after(survey, fine, places, int(cut)))
+            starts.append(_first_after(survey, fine, places, cut))
     return tuple(starts)
 
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 class _Limits:
     """By how much an overexposed frame exceeds the half of the clip that has least white."""
 
-    white: float = 0.02  # share of the values; what flicker of 1 % or noise turns white is less
+    white: float = 0.05  # share of the values; what noise or the glitter of water turns white is less
     # Factor of the level.  What turns white where the camera pans to a brighter part changes the level less.
-    brighter: float = 1.1
+    brighter: float = 1.25
 
 
 _LIMITS = _Limits()
