@@ -45,6 +45,7 @@ class _Limits:
     steep: float = 0.9  # quantile of the slopes from which s is measured
     outlier: float = 5.0  # deviations of P beyond which a pixel is of an overlay; white noise reaches 4.5
     high: float = 0.25  # cycles per pixel from which frequencies are high: half of the range
+    normal: float = 1.4826  # standard deviation of normal numbers in median absolute ones
     window: int = 4  # frames before and after a cut that are compared
     changed: float = 2.0  # least change of P at a cut, as a variance relative to what frames differ by elsewhere
     pixels: int = 1 << 16  # about how many pixels are compared at cuts
@@ -101,8 +102,8 @@ def _motion_beside_pattern(moments: Moments) -> NDArray[np.bool_] | None:
     if not usual.any() or np.mean(fine[usual] ** 2) < _LIMITS.clear**2 * noise / moments.count:
         return None
     slope, flicker = _squared_slope(fine)[usual], change[usual]
-    gained = float(np.mean((slope - slope.mean()) * (flicker - flicker.mean()))) / max(float(slope.var()), 1e-24)
-    if abs(gained) > _LIMITS.static * motion**2:
+    gained = abs(float(np.mean((slope - slope.mean()) * (flicker - flicker.mean()))))
+    if gained > _LIMITS.static * motion**2 * float(slope.var()):
         return None
     # Edges are few, so that motion is known only over wide windows.
     moved, slopes = (cv2.GaussianBlur(some * edges, (0, 0), min(mean.shape) / 8) for some in (moved, slopes))
@@ -170,8 +171,8 @@ def _white_part(image: FloatArray) -> FloatArray:
     fine = scipy.fft.idctn(spectrum * high, norm="ortho")
     white = _deviation(fine) ** 2 / high.mean()
     rings = (frequency * min(height, width) / 4).astype(np.int64)
-    power = np.bincount(rings.ravel(), np.square(spectrum, dtype=np.float64).ravel()) / np.bincount(rings.ravel())
-    share = np.minimum(white / np.maximum(power, 1e-24), 1).astype(np.float32)
+    power = np.bincount(rings.ravel(), np.square(spectrum).ravel()) / np.maximum(np.bincount(rings.ravel()), 1)
+    share = np.divide(white, power, out=np.ones_like(power), where=power > white).astype(np.float32)
     offsets = scipy.fft.idctn(spectrum * share[rings], norm="ortho")
     return np.asarray(offsets * _usual(offsets), np.float32)
 
@@ -181,7 +182,7 @@ def _usual(fine: FloatArray) -> NDArray[np.bool_]:
 
 
 def _deviation(fine: FloatArray) -> float:
-    return 1.4826 * float(np.median(np.abs(fine)))
+    return _LIMITS.normal * float(np.median(np.abs(fine)))
 
 
 def _squared_slope(image: FloatArray) -> FloatArray:

@@ -8,13 +8,13 @@ black borders         straight and moving, along most of three sides            
 stuck pixels          outside the range of their neighbours in every frame               median of the neighbours
 duplicated frames     every value equals that of the frame before                        leaves them out
 blank frames          a tenth of the usual contrast or less: lens cap, flash, dropout    leaves them out
-overexposed frames    brighter, and more of them is white, than half of the frames         leaves them out
+overexposed frames    brighter, and with more white, than half of the frames              leaves them out
 cuts                  two frames are not similar under any shift                         keeps the longest scene
 saturation            half of the values or more are white                               only warns
 ====================  =================================================================  =============================
 
 :func:`without_blank` finds blank frames alone, and leaves them out.
-The modules scene_cuts, stuck_pixels, repeats, black_borders and missing_pixels each detect one of these defects.
+The modules beside this one each detect one of these defects.
 """
 
 from __future__ import annotations
@@ -294,8 +294,7 @@ class _ContentScan:
         # In a video of one repeated frame there are no others to use.
         repeated = (~(left_out | duplicated)).sum() < 2
         left_out |= duplicated & ~repeated
-        bright = overexposed(np.frombuffer(self._white), np.frombuffer(self._levels), ~left_out)
-        left_out |= bright
+        left_out |= (bright := overexposed(np.frombuffer(self._white), np.frombuffer(self._levels), ~left_out))
         stuck = self._stuck.found()
         rows, columns = self._source.window
         if self._source.develop is not None:
@@ -369,8 +368,8 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
     if report.blank:
         lines.append(f"{len(report.blank)} blank: {numbers_text(report.blank)} left out")
     if report.overexposed:
-        which = f"{numbers_text(report.overexposed)} left out"
-        lines.append(f"{len(report.overexposed)} overexposed: {which}, as others show what is white in them")
+        which = numbers_text(report.overexposed)
+        lines.append(f"{len(report.overexposed)} overexposed: {which} left out; others show what is white in them")
     if report.duplicated and repeated:
         lines.append("all frames are the same: there is no turbulence to take out")
     elif report.duplicated:
