@@ -58,7 +58,7 @@ def test_frames_without_a_pattern_are_left(frames):
     noise = 0.015 * np.random.default_rng(1).standard_normal(frames.shape)
     moving = make_sequence(4, COUNT, SIDE, "chart", blur=0.5, noise=0.005, rms=0.6).frames
     still = np.repeat(frames[:1] + pattern(1), COUNT, axis=0) + 0.1 * noise
-    for some in (frames + noise, moving, still, frames[:4] + pattern(1), frames + 0.05 * pattern(1)):
+    for some in (frames + noise, moving, still, frames[:4] + pattern(1), frames + 0.15 * pattern(1)):
         survey = surveyed(np.float32(some))
         assert without_pixel_pattern(survey, measure_moments(survey)) == (survey, ())
 
