@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .agreement.sensor_pattern import without_stripes
 from .core.decision import Decision
 from .core.remarks import Doubt
 from .footage.background import without_moving_objects
@@ -18,6 +17,8 @@ from .footage.levels import Levels, stretch_levels
 from .footage.lighting.light import steady_light
 from .footage.lighting.white_balance import steady_white_balance
 from .footage.overlays import Title, read_static_mask, without_overlay
+from .footage.pixel_pattern import without_pixel_pattern
+from .footage.sensor_pattern import without_stripes
 from .footage.survey import measure_moments, take_survey
 from .io.source import FrameSource, Window
 from .results import Restoration, at_levels_of_clip
@@ -50,9 +51,11 @@ def prepare(source: FrameSource, static_mask: str = "auto", scratch: Path | None
     moments = measure_moments(survey)
     # Stripes before overlays: a dead column is static and would be taken for an overlay.
     survey, stripe_decisions = without_stripes(survey, moments)
+    moments = measure_moments(survey) if stripe_decisions else moments
+    survey, pattern_decisions = without_pixel_pattern(survey, moments)
     hidden, title, overlay_decisions = None, None, tuple[Decision, ...]()
     if static_mask != "off":
-        survey, hidden, title, overlay_decisions = without_overlay(survey, mask, None if stripe_decisions else moments)
+        survey, hidden, title, overlay_decisions = without_overlay(survey, mask, None if pattern_decisions else moments)
     if source.unseen is not None:
         unseen = source.unseen[source.window]
         hidden = unseen if hidden is None else hidden | unseen
@@ -64,6 +67,7 @@ def prepare(source: FrameSource, static_mask: str = "auto", scratch: Path | None
         *(Decision("input", "to be checked", found) for found in source.warnings if isinstance(found, Doubt)),
         *bar_decisions,
         *stripe_decisions,
+        *pattern_decisions,
         *overlay_decisions,
         *colour_decisions,
         *light_decisions,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from conftest import make_sequence
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.footage.checks.content import ContentParams, check_content, clean_source, without_blank
+from turbrestore.footage.checks.content import ContentParams, check_content, clean_source, keep_all, without_blank
 from turbrestore.footage.checks.stuck_pixels import StuckPixelDetector
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video
@@ -347,3 +347,23 @@ def test_a_cleaned_clip_is_restored_as_it_is(elsewhere):
     cleaned = clean_source(source, check_content(source))
     found = restore(cleaned, RestoreParams(until="centroid"))
     assert found.train == len(cleaned) and "blank frames" not in {one.subject for one in found.decisions}
+
+
+def test_frames_that_are_white_where_half_of_the_clip_shows_the_scene_are_left_out():
+    gains = np.tile([0.25, 1.0, 4.0], 5)[:, None, None]
+    scene = 0.1 + 0.8 * np.random.default_rng(0).random((32, 32))
+    bracket = FrameSource.from_array(np.float32(np.clip(gains * scene + noise(15), 0, 1)))
+    report = check_content(bracket)
+    assert report.overexposed == (2, 5, 8, 11, 14) and report.left_out == set(report.overexposed)
+    assert "5 overexposed: frames 2, 5, 8, 11, 14 left out" in " ".join(report.warnings)
+    assert keep_all(report).overexposed == ()
+    # White is no reason where most frames have it, or where frames are no brighter, as where the camera pans.
+    for some in (
+        np.clip(4 * scene + noise(15), 0, 1),
+        np.where(gains > 1, np.where(scene > 0.8, 1, 0.9 * scene), scene),
+    ):
+        assert check_content(FrameSource.from_array(np.float32(some + noise(15)).clip(0, 1))).overexposed == ()
+
+
+def noise(count):
+    return np.random.default_rng(1).normal(0, 0.002, (count, 32, 32))

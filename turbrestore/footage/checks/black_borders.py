@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.arrays import FloatArray
 from ...io.pixels import PixelArray
 
 # Highest 8-bit level that counts as black, because codecs add noise; size, in pixels, from which brighter spots are not
@@ -78,6 +79,15 @@ def black_border(pixels: PixelArray) -> NDArray[np.bool_]:
     for side, place in zip(_sides(pixels), _sides(marked), strict=True):
         _mark(side, place, _black(pixels))
     return marked
+
+
+def without_border(thumb: FloatArray, border: NDArray[np.bool_], before: FloatArray) -> FloatArray:
+    """Cover a black border with the previous thumbnail, so that a changing border is not taken for a cut."""
+    covered = cv2.resize(border.astype(np.float32), thumb.shape[::-1], interpolation=cv2.INTER_AREA) > 0
+    if covered.all():
+        return thumb
+    filled = np.where(covered, before - before[~covered].mean(), thumb - thumb[~covered].mean())
+    return np.asarray(filled - filled.mean(), np.float32)
 
 
 def _mark(side: PixelArray, place: NDArray[np.bool_], black: int) -> NDArray[np.float64] | None:

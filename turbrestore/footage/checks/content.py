@@ -8,12 +8,13 @@ black borders         straight and moving, along most of three sides            
 stuck pixels          outside the range of their neighbours in every frame               median of the neighbours
 duplicated frames     every value equals that of the frame before                        leaves them out
 blank frames          a tenth of the usual contrast or less: lens cap, flash, dropout    leaves them out
+overexposed frames    brighter, and with more white, than half of the frames              leaves them out
 cuts                  two frames are not similar under any shift                         keeps the longest scene
 saturation            half of the values or more are white                               only warns
 ====================  =================================================================  =============================
 
 :func:`without_blank` finds blank frames alone, and leaves them out.
-The modules scene_cuts, stuck_pixels, repeats, black_borders and missing_pixels each detect one of these defects.
+The modules beside this one each detect one of these defects.
 """
 
 from __future__ import annotations
@@ -23,7 +24,6 @@ import dataclasses
 from array import array
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,8 +33,9 @@ from ...core.errors import ConfigurationError, DataError, require_between
 from ...core.remarks import Doubt, counted
 from ...io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
 from ...io.source import FrameSource, numbers_text
-from .black_borders import BlackBorderDetector
+from .black_borders import BlackBorderDetector, without_border
 from .missing_pixels import FEW_MISSING, MOST_MISSING, Backdrop, fill_holes, mean_backdrop
+from .overexposure import overexposed
 from .repeats import RepeatDetector
 from .scene_cuts import Scene, SceneDetector, group_scenes, thumbnail
 from .stuck_pixels import StuckPixelDetector, repair_stuck
@@ -96,6 +97,8 @@ class ContentReport:
         Frames that equal the one before, but for noise of the recording or what a codec leaves.
     blank : tuple of int
         Frames without contrast.
+    overexposed : tuple of int
+        Frames that are white where other frames show the scene.
     scenes : tuple of Scene
         In the order of their first frames; one where there is no cut.
     saturated : float
@@ -117,6 +120,7 @@ class ContentReport:
     stuck: NDArray[np.int64]
     duplicated: tuple[int, ...]
     blank: tuple[int, ...]
+    overexposed: tuple[int, ...]
     scenes: tuple[Scene, ...]
     saturated: float
     contrast: float
@@ -219,7 +223,13 @@ def keep_all(report: ContentReport) -> ContentReport:
         # The backdrop is that of one scene; it must not show in the others.
         backdrop = dataclasses.replace(backdrop, black_borders=False)
     kept = dataclasses.replace(
-        report, blank=(), duplicated=(), scenes=report.scenes[:1], left_out=frozenset(), backdrop=backdrop
+        report,
+        blank=(),
+        overexposed=(),
+        duplicated=(),
+        scenes=report.scenes[:1],
+        left_out=frozenset(),
+        backdrop=backdrop,
     )
     return dataclasses.replace(kept, warnings=tuple(_in_words(kept, False)))
 
@@ -232,7 +242,7 @@ class _ContentScan:
         self._previous: PixelArray | None = None
         self._contrasts = array("d")
         self._usual = 0.0
-        self._saturated = 0.0
+        self._white, self._levels = array("d"), array("d")
         self._filled: list[int] = []
         self._filled_values = 0
         self._duplicated: list[int] = []
@@ -248,7 +258,8 @@ class _ContentScan:
     def update(self, number: int, pixels: PixelArray, mosaic: PixelArray | None) -> None:
         pixels = self._with_holes_filled(number, pixels)
         values = to_unit(pixels, self._source.full_scale, f"{self._source.name}: frame {number}")
-        self._saturated += np.count_nonzero(values >= 1) / values.size
+        self._white.append(np.count_nonzero(values >= 1) / values.size)
+        self._levels.append(float(values.mean()))
         if self._previous is not None and np.array_equal(pixels, self._previous):
             self._duplicated.append(number)
         self._previous = pixels
@@ -259,7 +270,7 @@ class _ContentScan:
             if border.any():
                 if self._bordered_scenes is None:
                     self._bordered_scenes = copy.deepcopy(self._scenes)
-                shown = _without_border(thumb, border, np.zeros_like(thumb) if self._shown is None else self._shown)
+                shown = without_border(thumb, border, np.zeros_like(thumb) if self._shown is None else self._shown)
             self._shown = shown
         contrast = float(thumb.std())
         self._contrasts.append(contrast)
@@ -288,6 +299,7 @@ class _ContentScan:
         # In a video of one repeated frame there are no others to use.
         repeated = (~(left_out | duplicated)).sum() < 2
         left_out |= duplicated & ~repeated
+        left_out |= (bright := overexposed(np.frombuffer(self._white), np.frombuffer(self._levels), ~left_out))
         stuck = self._stuck.found()
         rows, columns = self._source.window
         if self._source.develop is not None:
@@ -307,8 +319,9 @@ class _ContentScan:
             stuck=stuck,
             duplicated=tuple(numbers[duplicated].tolist()),
             blank=tuple(numbers[blank].tolist()),
+            overexposed=tuple(numbers[bright].tolist()),
             scenes=scenes,
-            saturated=float(self._saturated) / len(numbers),
+            saturated=float(np.mean(self._white)),
             contrast=float(contrasts.max()),
             left_out=frozenset(numbers[left_out].tolist()),
             warnings=(),
@@ -341,15 +354,6 @@ class _ContentScan:
         return filled
 
 
-def _without_border(thumb: FloatArray, border: NDArray[np.bool_], before: FloatArray) -> FloatArray:
-    """Cover a black border with the previous thumbnail, so that a changing border is not taken for a cut."""
-    covered = cv2.resize(border.astype(np.float32), thumb.shape[::-1], interpolation=cv2.INTER_AREA) > 0
-    if covered.all():
-        return thumb
-    filled = np.where(covered, before - before[~covered].mean(), thumb - thumb[~covered].mean())
-    return np.asarray(filled - filled.mean(), np.float32)
-
-
 def _in_words(report: ContentReport, repeated: bool) -> list[str]:
     if report.contrast == 0:
         return ["every frame is of one intensity: there is no scene"]
@@ -368,6 +372,9 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
         )
     if report.blank:
         lines.append(f"{len(report.blank)} blank: {numbers_text(report.blank)} left out")
+    if report.overexposed:
+        which = numbers_text(report.overexposed)
+        lines.append(f"{len(report.overexposed)} overexposed: {which} left out; others show what is white in them")
     if report.duplicated and repeated:
         lines.append("all frames are the same: there is no turbulence to take out")
     elif report.duplicated:

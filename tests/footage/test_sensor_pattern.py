@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from conftest import make_sequence, surveyed
-from turbrestore.agreement.sensor_pattern import _dead, without_stripes
+from turbrestore.footage.sensor_pattern import _dead, without_stripes
 
 SIDE = 160
 

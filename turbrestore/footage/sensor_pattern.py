@@ -19,14 +19,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..core.gradient import sobel_gradient
-from ..footage.placement import relative_window
-from ..footage.survey import Moments, Survey, measure_moments
 from ..io.source import Window
+from .placement import relative_window
+from .survey import Moments, Survey, measure_moments
 
 # Fewest frames from which stripes are found.
 _FEWEST = 8
@@ -135,7 +134,8 @@ def _offsets(mean: FloatArray, variance: FloatArray, error: float, motion: float
 def _dead(variance: FloatArray, noise: float) -> NDArray[np.bool_]:
     """Mark the columns that have no noise while those around do."""
     level = np.sqrt(np.median(variance, axis=0)).astype(np.float32)
-    around = median_filter(level, 2 * _AROUND + 1, mode="mirror")
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(level, _AROUND, mode="reflect"), 2 * _AROUND + 1)
+    around = np.median(windows, axis=1)
     dead = level < _DEAD * np.minimum(around, noise if noise > _LEAST_NOISE else 0)
     if dead.mean() > _MOST_DEAD:
         return np.zeros_like(dead)
