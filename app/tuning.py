@@ -80,7 +80,8 @@ def automatic_fidelity(restored: Restored, params: DeconvolutionParams) -> float
     -------
     float
     """
-    return whole_image_fidelity(_fused(restored), dataclasses.replace(params, fidelity=None))
+    params, noise = dataclasses.replace(params, fidelity=None), restored.restoration.noise
+    return whole_image_fidelity(_fused(restored), params, params.sigma or 0.0, noise)
 
 
 def impressions(

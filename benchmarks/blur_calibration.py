@@ -87,7 +87,7 @@ def measure_case(folder: Path, case: Case) -> Figures:
     frames, flows, image = held["frames"].astype(np.float32) / 255, held["flows"].astype(np.float32), held["filtered"]
     seeing = float(held["seeing"].squeeze())
     moved = float(np.mean(np.square(flows))) if np.isnan(seeing) else seeing
-    witnesses = measure_witnesses(frames, flows, BlurWitnesses(moved, float(len(frames))))
+    witnesses = measure_witnesses(frames, flows, image, BlurWitnesses(moved, float(len(frames))))
     truth = held["truth"] if case.kind == "quiet" else registered(held["truth"], image)
     (width,), (exponent,) = shapes(transfer_function(image, truth)[None])
     results = {

@@ -26,7 +26,6 @@ from pathlib import Path
 
 import numpy as np
 
-from .agreement.halves import halves_memory
 from .agreement.last_guard import keep_agreed_memory
 from .blind.remove_blur import SMALLEST_SIDE, remove_blur_memory
 from .core.decision import Decision
@@ -36,6 +35,7 @@ from .filtering.filter_records import filter_memory
 from .footage.survey import survey_memory, survey_scratch_bytes
 from .registration.flow import MIN_SIDE
 from .registration.opencv_flow import flow_memory
+from .registration.registered_noise import halves_memory
 from .runtime.device import TORCH_BYTES, find_device, needs_torch
 from .runtime.jit import COMPILER_BYTES
 from .runtime.memory_size import size_text

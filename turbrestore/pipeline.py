@@ -10,7 +10,6 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .agreement.halves import HalvedClip, Halves, halve
 from .agreement.last_guard import Guarded, keep_agreed
 from .blind.remove_blur import SIGMAS_A_SIDE, Deblurred, remove_blur_steps
 from .blind.structure import compare_structure
@@ -39,6 +38,7 @@ from .registration.coverage import Rectangle, coverage, well_seen
 from .registration.flow import MIN_SIDE
 from .registration.flow_algebra import invert_flow
 from .registration.recentring import recentre, recentring_flow
+from .registration.registered_noise import HalvedClip, Halves, halve
 from .registration.warp import warp
 from .results import Restoration, Store
 from .runtime.allocator import returning_freed_memory
@@ -234,8 +234,8 @@ def _check_by_frames(
     # No guard overrides a width that was asked for.
     if not run.params.finds_blur:
         return fused, _Evidence(saturation)
-    halves = halves.recentred(mean_flow)
-    witnesses = replace(_find_witnesses(run, training, fused), noise=_fused_noise(fused, halves))
+    witnesses, halves = _find_witnesses(run, training, fused, halves.alternate.mean), halves.recentred(mean_flow)
+    witnesses = replace(witnesses, noise=_fused_noise(fused, halves))
     return fused, _Evidence(saturation, False, witnesses, halves)
 
 
@@ -275,6 +275,7 @@ def _deblur_and_crop(run: Run, fused: Restoration, evidence: _Evidence, psf: NDA
         decisions=tuple(run.decisions),
         uncertainty=None if deviation is None else deviation[part],
         disagreement=None if agreed is None else agreed.share[part],
+        noise=None if evidence.witnesses is None else evidence.witnesses.noise,
     )
     if deblurred is None:
         return restoration
@@ -325,8 +326,8 @@ def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seein
     return seeing
 
 
-def _find_witnesses(run: Run, training: FloatArray, fused: Restoration) -> BlurWitnesses:
-    """Measure what the frames say about their blur."""
+def _find_witnesses(run: Run, training: FloatArray, fused: Restoration, mean: FloatArray) -> BlurWitnesses:
+    """Measure what the frames say about their blur; ``mean`` (H, W[, 3]) is that of the registered frames."""
     seeing = fused.seeing
     measured = None if seeing is None else seeing.displacement_variance
     rows, columns = picture = run.prepared.picture
@@ -340,7 +341,7 @@ def _find_witnesses(run: Run, training: FloatArray, fused: Restoration) -> BlurW
             displacement, frames = float(np.mean(variances)), float(len(training))
         error = float(np.sqrt(variance_of(flows).mean() / len(training)))
         known = BlurWitnesses(displacement, frames, picture, position_error=error)
-        return measure_witnesses(cropped, flows, _of_optics(known, run, seeing))
+        return measure_witnesses(cropped, flows, mean[rows, columns], _of_optics(known, run, seeing))
 
 
 def _of_optics(known: BlurWitnesses, run: Run, seeing: Seeing | None) -> BlurWitnesses:

@@ -14,6 +14,7 @@ from .blur.estimation import BlurEstimate
 from .blur.posterior import BlurPosterior
 from .core.arrays import FloatArray
 from .core.decision import Decision
+from .core.noise_spectrum import NoiseSpectrum
 from .core.remarks import counted
 from .deconvolution.deconvolve import Deconvolution
 from .display.maps import plot_images
@@ -132,6 +133,8 @@ class Restoration:
     disagreement : ndarray, float32, shape (H, W), or None
         Share, 0 to 1, of the mean of the registered frames in the image: where they do not agree on its detail or
         colour, and in flat parts that ring or are noisy; None unless the image was deblurred.
+    noise : NoiseSpectrum or None
+        Noise of the filtered image at every frequency, in the levels of the stages; None unless a blur is looked for.
     """
 
     image: FloatArray
@@ -152,6 +155,7 @@ class Restoration:
     posterior: BlurPosterior | None = None
     finer: FloatArray | None = None
     disagreement: FloatArray | None = None
+    noise: NoiseSpectrum | None = None
 
     @property
     def motion(self) -> float:

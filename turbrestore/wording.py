@@ -136,8 +136,8 @@ def explain_structure(reading: StructureReading) -> tuple[Decision, ...]:
     if reading.changes:
         reason = (
             f"registration leaves {reading.left:.0%} of the differences of the frames (bound {LEFT:.0%}), and "
-            f"{reading.lasting:.0%} of that lasts for half of the clip (bound {LASTING:.0%}): the scene itself changes; "
-            "use fewer frames (--frames 0:N), during which it does not"
+            f"{reading.lasting:.0%} of that lasts for half of the clip (bound {LASTING:.0%}): the scene itself "
+            "changes; use fewer frames (--frames 0:N), during which it does not"
         )
         return (Decision("structure", "the mean of the frames is the result", reason),)
     reason = (

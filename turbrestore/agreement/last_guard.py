@@ -2,10 +2,10 @@
 
 Symbols
 -------
-A, B : two halves of the clip (:mod:`turbrestore.agreement.halves`), deblurred linearly as the result is
+A, B : two halves of the clip (:mod:`turbrestore.registration.registered_noise`), deblurred linearly as the result is
 b : one of four bands of detail, differences of Gaussians of 0, 1, 2, 4 and 8 pixels
-r : correlation of b of A with b of B in a window, the smaller one of both ways to halve the clip; ρ = 2 r / (1 + r) that
-    of their mean with the scene (Spearman and Brown), as far as the frames tell
+r : correlation of b of A with b of B in a window, the smaller one of both ways to halve the clip; ρ = 2 r / (1 + r)
+    that of their mean with the scene (Spearman and Brown), as far as the frames tell
 g : share of the mean in a band of the result
 n² : variance of the noise of the mean in a small window
 
@@ -37,7 +37,7 @@ import numpy as np
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..core.noise_spectrum import SIDE, NoiseSpectrum
-from .halves import Halves
+from ..registration.registered_noise import Halves
 
 # Gaussians that separate the bands; the window of a band, in these and in pixels.
 _SCALES = (1.0, 2.0, 4.0, 8.0)

@@ -169,9 +169,9 @@ def tiled_deconvolution_steps(
         part = yield from deconvolve_steps(cut, sigma, params, guide_part, runtime, photons, full_scale, noise)
         add_tile(restored, tile, part.image)
         parts.append(replace(part, image=restored))
-    noise = float(np.sqrt(np.mean([part.noise**2 for part in parts])))
+    level = float(np.sqrt(np.mean([part.noise**2 for part in parts])))
     slowest = max(parts, key=lambda part: part.iterations)
-    return replace(slowest, noise=noise, converged=all(part.converged for part in parts))
+    return replace(slowest, noise=level, converged=all(part.converged for part in parts))
 
 
 def remove_blur_memory(shape: tuple[int, ...], params: DeconvolutionParams, side: int | None = None) -> float:

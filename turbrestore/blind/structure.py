@@ -11,9 +11,9 @@ them at full contrast.
 
 The share is of edges and not of the frame, so that it does not depend on how much of it is empty.
 
-Registration also follows texture that renews itself, such as the granulation of the Sun, and bends the frames until it
-looks alike.  Two things tell that.  Registration leaves much of what the frames differ by, noise apart.  And much of what
-it leaves lasts: the beginning and the end of the clip differ by more than independent frames would.
+Registration also follows texture that renews itself, such as the granulation of the Sun, and bends the frames until
+they look alike.  Two things tell that.  Registration leaves much of what the frames differ by, noise apart.  And much
+of what it leaves lasts: the beginning and the end of the clip differ by more than independent frames would.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def _registered(
 
 
 def _compare_window(frames: Iterable[Any], direction: FloatArray, edges: NDArray[np.bool_]) -> NDArray[Any]:
-    """Edges that are shown and those that are unseen; sums of the variances of registered and of plain frames; pixels."""
+    """Edges that are shown, those that are unseen, sums of the variances of registered and plain frames, and pixels."""
     shown, had, *moments = (np.zeros(edges.shape) for _ in range(6))
     count = 0
     for plain, registered, x, y, seen in frames:

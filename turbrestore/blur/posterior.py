@@ -44,6 +44,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
 from ..core.noise_spectrum import NoiseSpectrum
+from ..registration.registered_noise import noise_of_frames
 from .psf import Float64Array
 from .witnesses.hypotheses import LEAST_TRANSFER, Hypotheses, hypotheses, shapes
 from .witnesses.image_evidence import EXPONENTS, ImageEvidence
@@ -128,16 +129,18 @@ class BlurPosterior:
     expected_power_variation: Float64Array
 
 
-def measure_witnesses(frames: FloatArray, flows: FloatArray, known: BlurWitnesses) -> BlurWitnesses:
+def measure_witnesses(frames: FloatArray, flows: FloatArray, mean: FloatArray, known: BlurWitnesses) -> BlurWitnesses:
     """Add to what is known what frames (T, H, W[, 3]) say that are registered by flows (T, H, W, 2), pixels.
 
+    ``mean`` (H, W[, 3]) is the mean of the registered frames.
     Windows of 64 pixels resolve blurs of up to three pixels; for wider ones, frames are reduced.
     """
-    witnesses = replace(known, variation=measure_variation(frames, flows))
+    noise = noise_of_frames(frames, flows, mean)
+    witnesses = replace(known, variation=measure_variation(frames, flows, noise))
     for reduction in _REDUCTIONS:
         if blur_posterior(None, witnesses).width[1] <= _WIDEST * reduction / 2:
             break
-        reduced = measure_variation(frames, flows, reduction)
+        reduced = measure_variation(frames, flows, noise, reduction)
         if reduced is None:
             break
         witnesses = replace(witnesses, variation=reduced)

@@ -8,9 +8,10 @@ m : the scene, as the mean of the frames shows it
 N : power spectrum of the noise of d, squared intensity; that of white noise of variance n² is n² at every frequency
 e : share of the power of the scene by which d differs too, because the images are not registered exactly
 
-In a window, the expected power spectra of d and m at a frequency are ``P_d = N + e P_m``.  Windows differ in P_m, so they
-tell both: N is what flat ones have, e what those with detail have beyond it.  Both follow, for every ring of frequencies,
-by least squares in which a window counts by the inverse of its variance, which is proportional to (N + e P_m)².
+In a window, the expected power spectra of d and m at a frequency are ``P_d = N + e P_m``.  Windows differ in P_m, so
+they tell both: N is what flat ones have, e what those with detail have beyond it.  Both follow, for every ring of
+frequencies, by least squares in which a window counts by the inverse of its variance, which is proportional to
+(N + e P_m)².
 
 A camera's noise reduction, a codec, a digital zoom, demosaicing, film grain and the interpolation of the registration
 all make noise that is smooth: N falls with the frequency.  Differences of neighbouring pixels do not see such noise.
@@ -18,11 +19,11 @@ all make noise that is smooth: N falls with the frequency.  Differences of neigh
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from .arrays import FloatArray
@@ -31,6 +32,8 @@ from .arrays import FloatArray
 SIDE, _MOST_WINDOWS = 32, 16
 # Centres of the rings, cycles per pixel.  The last one holds the corners too.
 RINGS: NDArray[np.float64] = np.arange(SIDE // 2 + 1) / SIDE
+# Of several differences the lower quartile counts, because some may show what the others do not.
+_QUARTILE = 0.25
 # Rounds of the weighted least squares, which settle within three or four.
 _ROUNDS = 6
 # Least power of noise, squared intensity: a hundredth of the rounding of 16 bits.
@@ -66,13 +69,21 @@ def fit_noise_spectrum(differences: Iterable[FloatArray], scene: FloatArray) -> 
     """Fit N and e to differences, each (H, W), of images of one scene (H, W); see the docstring of the module."""
     of_scene = window_powers(scene)
     powers = [window_powers(difference) for difference in differences]
-    # The lower quartile over the differences, because some may show what the others do not.
-    found = np.array(
-        [_fit_ring(ring, m) for ring, m in zip(np.quantile(powers, 0.25, axis=0).T, of_scene.T, strict=True)]
-    )
+    usual = np.quantile(powers, _QUARTILE, axis=0) / _quartile_of_noise(len(powers))
+    found = np.array([_fit_ring(ring, m) for ring, m in zip(usual.T, of_scene.T, strict=True)])
     # The mean of each window is taken out, which leaves half of the lowest ring.
     found[0] = found[1]
     return NoiseSpectrum(*np.maximum(found.T, [[_LEAST], [0], [0]]))
+
+
+@functools.cache
+def _quartile_of_noise(count: int) -> Float64Array:
+    """Lower quartile of the power of white noise in ``count`` windows, relative to its mean, by ring (rings,)."""
+    if count == 1:
+        return np.ones_like(RINGS)
+    white = np.random.default_rng(0).standard_normal((count, 8 * SIDE, 8 * SIDE), np.float32)
+    powers = np.array([window_powers(image) for image in white])
+    return np.quantile(powers, _QUARTILE, axis=0).mean(axis=0) / powers.mean(axis=(0, 1))
 
 
 def window_powers(image: FloatArray) -> Float64Array:
@@ -83,7 +94,7 @@ def window_powers(image: FloatArray) -> Float64Array:
     starts = (_starts(length, side) for length in image.shape)
     every = np.lib.stride_tricks.sliding_window_view(image, (side, side))[np.ix_(*starts)].reshape(-1, side, side)
     tapered = (every - every.mean(axis=(1, 2), keepdims=True)) * profile
-    power = np.square(np.abs(scipy.fft.fft2(tapered))).reshape(len(tapered), -1) / np.square(profile).sum()
+    power = np.square(np.abs(np.fft.fft2(tapered))).reshape(len(tapered), -1) / np.square(profile).sum()
     nu = np.fft.fftfreq(side)
     ring = np.minimum(np.rint(np.hypot(nu[:, None], nu) * SIDE), SIDE // 2).astype(int).ravel()
     present = np.unique(ring)

@@ -21,7 +21,7 @@ import scipy
 from ..core.arrays import FloatArray, luminance
 from ..core.noise import fit_noise_curve
 from ..core.noise_spectrum import NoiseSpectrum
-from ..registration.noise_of_frames import noise_of_frames
+from ..registration.registered_noise import noise_of_frames
 from ..registration.warp import warp
 from ..runtime.scratch import iter_frames
 from ..runtime.threads import map_ahead, sum_in_threads

@@ -37,7 +37,7 @@ from ..runtime.threads import map_ahead, sum_in_threads
 from .camera.stabilisation import mean_stabilised
 from .flow import FlowFrame, FlowParams, measure_flows, normalise_contrast, prepare_reference
 from .flow_algebra import compose_flows, invert_flow
-from .noise_of_frames import noise_of_frames
+from .registered_noise import noise_of_frames
 from .warp import inside, warp
 
 if TYPE_CHECKING:

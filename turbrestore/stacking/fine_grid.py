@@ -30,7 +30,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..agreement.halves import Halves
 from ..agreement.last_guard import keep_agreed
 from ..blind.remove_blur import guarded_steps
 from ..blur.psf import GAUSSIAN, blur_otf
@@ -39,6 +38,7 @@ from ..core.decision import Decision
 from ..deconvolution.deconvolve import Deconvolution, deconvolve_steps
 from ..deconvolution.stopping import Steps
 from ..preparation import Prepared
+from ..registration.registered_noise import Halves
 from ..results import Restoration
 from ..runtime.runtime import Runtime
 from ..runtime.steps import finish

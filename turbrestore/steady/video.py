@@ -165,7 +165,7 @@ def _find_witnesses(window: Window, image: FloatArray) -> BlurWitnesses:
     still = np.zeros((*grid_of(image.shape), 2), np.float32)
     flows = np.stack([enlarged(measure_flow(image, frame, still), image.shape) for frame in frames])
     displacement = float(np.square(flows - np.median(flows, axis=(1, 2), keepdims=True)).mean())
-    return measure_witnesses(frames, flows, BlurWitnesses(displacement, float(len(frames))))
+    return measure_witnesses(frames, flows, image, BlurWitnesses(displacement, float(len(frames))))
 
 
 def _find_blur(image: FloatArray, witnesses: BlurWitnesses, runtime: Runtime) -> tuple[float, float]:

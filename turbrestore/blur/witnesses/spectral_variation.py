@@ -9,8 +9,8 @@ s_4 : ``Var |F|² / (E |F|²)²``, the same of powers, which a shift of a window
 ε : root mean square of the derivatives of the flow, by which registration stretches a blur
 
 The scene cancels in both ratios.  Both are means over a ring of frequencies and over windows that are weighted by their
-power.  The spectrum of the noise is that of white noise after the interpolation of the registration, scaled to the
-highest frequencies, at which no signal is left.
+power.  The noise of a frame, which the ratios must not contain, is known at every frequency
+(:mod:`turbrestore.registration.registered_noise`).
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray, luminance
+from ...core.noise_spectrum import NoiseSpectrum
 from ...registration.warp import sample_splines
 from ...runtime.image_stacks import spline_planes
 from ...runtime.scratch import drop_pages
@@ -34,8 +35,8 @@ SIDE, _BORDER = 64, 16
 _WINDOWS, _FRAMES = 5, 48
 # Fewest frames that are compared.
 _FEWEST = 4
-# Frames by whose flows white noise is warped, and highest rings, from which the noise is taken.
-_NOISE_FRAMES, _NOISE_RINGS = 4, 4
+# Frames whose flows tell the stretch.
+_STRETCHES = 4
 # Least power of the noise: a standard deviation of 10⁻⁴ under the window.
 _LEAST_NOISE = 1e-8 * SIDE**2 * 9 / 64
 # Frequencies of the rings, cycles per pixel.
@@ -76,20 +77,22 @@ class SpectralVariation:
         return ratio
 
 
-def measure_variation(frames: FloatArray, flows: FloatArray, reduction: int = 1) -> SpectralVariation | None:
+def measure_variation(
+    frames: FloatArray, flows: FloatArray, noise: NoiseSpectrum, reduction: int = 1
+) -> SpectralVariation | None:
     """Measure how the spectra of frames (T, H, W[, 3]) vary that are registered by flows (T, H, W, 2), pixels.
 
-    None if there are fewer than four frames that show a window, or if the reduced image has no room for one.
+    ``noise`` is that of a registered frame.  None if there are fewer than four frames that show a window, or if the
+    reduced image has no room for one.
     """
     height, width = (length // reduction for length in frames.shape[1:3])
     corners = _corners(height, width)
     if len(frames) < _FEWEST or not corners:
         return None
     picked = np.linspace(0, len(frames) - 1, min(len(frames), _FRAMES)).round().astype(int)
-    rng, sums, stretches, responses = np.random.default_rng(0), [], [], []
-    every = -(-len(picked) // _NOISE_FRAMES)
+    sums, stretches, every = [], [], -(-len(picked) // _STRETCHES)
     for top, left in corners:
-        spectra, noise = [], []
+        spectra = []
         for count, number in enumerate(picked):
             found = _around(frames[number], flows[number], top, left, reduction)
             if found is None:
@@ -97,19 +100,18 @@ def measure_variation(frames: FloatArray, flows: FloatArray, reduction: int = 1)
             plane, flow = found
             spectra.append(_spectrum(_warped(plane, flow)))
             if count % every == 0:
-                white = rng.standard_normal(plane.shape).astype(np.float32)
-                noise.append(_spectrum(_warped(white, flow)))
                 smooth = cv2.GaussianBlur(flow, (0, 0), _SMOOTH)
                 stretches.append(float(np.mean([np.square(np.diff(smooth, axis=axis)).mean() for axis in (0, 1)])))
-        if len(spectra) >= _FEWEST and noise:
+        if len(spectra) >= _FEWEST and stretches:
             sums.append(_sums(np.array(spectra)))
-            responses.append(_by_ring(np.square(np.abs(np.array(noise))).mean(axis=0)))
         drop_pages(frames)
         drop_pages(flows)
     if not sums:
         return None
-    response = np.mean(responses, axis=0)
-    return _ratios(np.array(sums), response / response[2:6].mean(), len(picked), float(np.mean(stretches)), reduction)
+    # Means of pixels keep the power of the noise for each area, and spectra here are not normalised.
+    power = noise.at(RINGS / reduction) / reduction**2 * np.square(_profile()).sum()
+    power = np.maximum(power, _LEAST_NOISE)
+    return _ratios(np.array(sums), power, len(picked), float(np.mean(stretches)), reduction)
 
 
 def window_power(image: FloatArray, reduction: int = 1) -> Float64Array:
@@ -207,14 +209,9 @@ def _sums(spectra: NDArray[np.complex64]) -> Float64Array:
     return np.array([_by_ring(part) for part in (variance, coherent, mean_power, square, spread)])
 
 
-def _ratios(
-    sums: Float64Array, response: Float64Array, frames: int, stretch: float, reduction: int
-) -> SpectralVariation:
+def _ratios(sums: Float64Array, noise: Float64Array, frames: int, stretch: float, reduction: int) -> SpectralVariation:
     """Ratios of the sums over windows (n, 5, rings), and their errors by leaving out one window after the other."""
     number = len(sums)
-    # Frames without any noise are taken to have this noise.
-    level = float(np.median((sums[:, 0].mean(axis=0) / response)[-_NOISE_RINGS:]))
-    noise = max(level, _LEAST_NOISE) * response
 
     def ratios(mean: Float64Array) -> Float64Array:
         variance, coherent, power, square, spread = mean

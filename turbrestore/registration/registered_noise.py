@@ -1,10 +1,14 @@
-"""Halves of a clip: what the registered frames share, and the noise of their mean.
+"""Noise of registered frames and of their mean, and the halves of a clip that tell the latter.
 
 Symbols
 -------
 A, B : means of the registered frames of two halves; half their difference has the noise of the mean of all frames, and
     nothing of the scene
-N : spectrum of that noise (:mod:`turbrestore.core.noise_spectrum`)
+N : spectrum of noise (:mod:`turbrestore.core.noise_spectrum`)
+
+The noise of a frame is what it has beside the mean of all, and beside what is in proportion to the scene: that of the
+sensor and the codec, smooth or not, and texture that changes from frame to frame.  Flow that matches a frame with a
+reference matches such noise too, unless it is told how strong it is.
 
 A clip is halved twice: into every other frame, and into its beginning and its end.  Alternate frames differ by what is
 new in every frame.  Beginning and end differ by that too, and by what lives for several frames: texture that renews
@@ -14,17 +18,34 @@ part of the scene either.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..core.arrays import FloatArray, luminance
 from ..core.noise_spectrum import NoiseSpectrum, fit_noise_spectrum
-from ..registration.recentring import recentre
-from ..registration.warp import warp
 from ..runtime.scratch import iter_frames
 from ..runtime.threads import map_ahead
+from .recentring import recentre
+from .warp import warp
+
+# One after the other, or stacked.
+Frames = Sequence[FloatArray] | FloatArray
+# Frames whose noise is looked at: their windows tell the spectrum to a few percent.
+_FRAMES = 8
+
+
+def noise_of_frames(frames: Frames, flows: Frames, mean: FloatArray) -> NoiseSpectrum:
+    """Spectrum of the noise of a frame, by frames (H, W[, 3]) registered by their flows (H, W, 2) and their mean.
+
+    ``mean`` (H, W[, 3]).
+    """
+    grey, count = luminance(mean), len(frames)
+    picked = np.unique(np.linspace(0, count - 1, min(count, _FRAMES)).round().astype(int))
+    residuals = (luminance(warp(frames[number], flows[number])) - grey for number in picked)
+    # The mean contains a part of the noise of each frame.
+    return fit_noise_spectrum(residuals, grey).scaled(count / max(count - 1, 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,13 +103,8 @@ def halve(
         quarter = number % 2, 2 * number // count
         sums[quarter] += registered
         counts[quarter] += 1
-    halves = (
-        Halves(
-            *(total / np.float32(some) for total, some in zip(sums.sum(axis=axis), counts.sum(axis=axis), strict=True))
-        )
-        for axis in (1, 0)
-    )
-    return HalvedClip(next(halves), next(halves), count)
+    alternate, lasting = (Halves(*(sums.sum(axis=axis).T / np.maximum(counts.sum(axis=axis), 1)).T) for axis in (1, 0))
+    return HalvedClip(alternate, lasting, count)
 
 
 def halves_memory(shape: tuple[int, ...], threads: int) -> float:
