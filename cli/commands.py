@@ -181,6 +181,7 @@ def as_typed(message: str, words: list[str]) -> str:
     fitting = [option for option in typed if option.removeprefix("--").rpartition(".")[2] == wanted]
     if len(fitting) == 1:
         message = f"{fitting[0]}{colon}{rest}"
+    message = message.replace("allow damaged ones to be skipped", "add --skip-damaged")
     return message.replace("allow overwriting", "add --overwrite")
 
 

@@ -135,8 +135,8 @@ def steady(
     source = _from_stream(input, selection, shape) if streamed else _from_file(input, selection, quiet)
     fps, depth = source.fps or USUAL_RATE, source.bit_depth if written.bit_depth is None else written.bit_depth
     companion = source.frames if isinstance(source.frames, FrameSource) else None
-    if companion is not None and companion.colour is not None and companion.colour[1] in CURVES:
-        encoding = _encoding_of_hdr(encoding, output)
+    encoding = _encoding_for(companion, encoding, output)
+    _tell_lost_bits(source, written, encoding, output, quiet or piped_out)
     facts, started = _Facts(), time.monotonic()
     with tempfile.TemporaryFile() as masks:
         with progress_bars(quiet) as progress:
@@ -174,8 +174,10 @@ def settings_record(machine: Machine, selection: Selection, params: SteadyParams
     return {name: value for record in records for name, value in dataclasses.asdict(record).items()}
 
 
-def _encoding_of_hdr(encoding: Encoding, output: Path) -> Encoding:
-    """HEVC of 10 bits for HDR in .mp4: H.264 has 8 bits, in which codes of HLG and PQ show bands."""
+def _encoding_for(source: FrameSource | None, encoding: Encoding, output: Path) -> Encoding:
+    """Choose HEVC of 10 bits for HDR in .mp4: H.264 has 8 bits, in which codes of HLG and PQ show bands."""
+    if source is None or source.colour is None or source.colour[1] not in CURVES:
+        return encoding
     suffix = output.suffix.lower()
     is_h264 = suffix in (".mp4", ".mkv") and encoding.codec is None and encoding.codec_of(suffix) == "h264"
     return dataclasses.replace(encoding, codec="hevc") if is_h264 else encoding
@@ -232,11 +234,24 @@ def _check_depth(written: Output, output: Path, raw: bool) -> None:
         return
     check_depth(depth)
     require(not raw, "--bit-depth: has no effect on raw frames, which have 8 bits; leave it out")
-    kind = written.encoding().codec_of(suffix) if suffix in (".mkv", ".mp4") else suffix
+    kind = _kind(written.encoding(), suffix)
     most = _MOST_BITS.get(kind, depth)
     require(
         depth <= most, f"--bit-depth: expected at most {most}, as {kind} has, found {depth}; .mkv by default has 16"
     )
+
+
+def _kind(encoding: Encoding, suffix: str) -> str:
+    """Codec of an output, or its suffix where that is its format."""
+    return encoding.codec_of(suffix) if suffix in (".mkv", ".mp4") else suffix
+
+
+def _tell_lost_bits(source: _Source, written: Output, encoding: Encoding, output: Path, quiet: bool) -> None:
+    """Say that the output holds fewer bits than the input, where nobody has asked for that."""
+    kind = _kind(encoding, output.suffix.lower())
+    most = _MOST_BITS.get(kind, source.bit_depth)
+    if written.bit_depth is None and source.bit_depth > most:
+        say(f"{output}: {kind} holds {most} of the {source.bit_depth} bits of the input; .mkv by default has 16", quiet)
 
 
 def _raw_shape(raw: str | None) -> tuple[int, ...] | None:

@@ -377,6 +377,8 @@ def check_cut_short(
     if intact < 1:
         raise DataError(f"{path}: {problem} before the end of the first frame; copy the file again")
     remedy = f"copy the file again or select frames up to {intact}"
+    if problem == "damaged":
+        remedy = f"copy the file again, select frames up to {intact} or allow damaged ones to be skipped"
     raise DataError(f"{path}: {found}; {remedy}")
 
 
