@@ -82,6 +82,7 @@ def steady(
     overwrite: Flag = False,
     json: Flag = False,
     quiet: Flag = False,
+    verbose: Flag = False,
     params: Annotated[SteadyParams, Parameter(name="*")] = SteadyParams(),
 ) -> None:
     """Steady and sharpen a video; what moves keeps moving.
@@ -113,17 +114,18 @@ def steady(
         Print the facts of the run as JSON.  They go to standard output.
     quiet : bool
         Print neither progress nor remarks.
+    verbose : bool
+        Say where scenes begin and how much blur is removed from then on.
     """
     piped_in, piped_out = str(input) == "-", str(output) == "-"
     is_camera = re.fullmatch(r"/dev/video\d+", str(input)) is not None
     streamed = piped_in or is_camera
     encoding, shape = written.encoding(), _raw_shape(raw)
     require(raw is None or piped_in, "--raw: has no effect unless the input is -; leave it out")
-    require(not (piped_out and json), "--json: contradicts the output -, which is standard output; leave it out")
-    require(not piped_out or encoding == BY_SUFFIX, "--codec, --crf: have no effect on the output -; leave them out")
     require(
         not (report and (streamed or piped_out)), "--report: compares two files, and a stream is none; leave it out"
     )
+    _check_printed(encoding, json, quiet and verbose, piped_out)
     _check_depth(written, output, piped_out and raw is not None)
     inputs = files_read(selection, None if streamed else input, config)
     settings_path = output.with_name(output.name + ".toml")
@@ -137,7 +139,7 @@ def steady(
     companion = source.frames if isinstance(source.frames, FrameSource) else None
     encoding = _encoding_for(companion, encoding, output)
     _tell_lost_bits(source, written, encoding, output, quiet or piped_out)
-    facts, started = _Facts(), time.monotonic()
+    facts, started = _Facts(verbose), time.monotonic()
     with tempfile.TemporaryFile() as masks:
         with progress_bars(quiet) as progress:
             total = len(companion) if companion is not None else 0
@@ -166,6 +168,13 @@ def steady(
         print_json({**paths, **facts.record()})
     else:
         say(f"{output}: {facts.text()}", quiet)
+
+
+def _check_printed(encoding: Encoding, json: bool, is_torn: bool, piped: bool) -> None:
+    """Refuse options about what is printed that contradict each other, or a video on standard output."""
+    require(not is_torn, "--verbose: contradicts --quiet; leave one of them out")
+    require(not (piped and json), "--json: contradicts the output -, which is standard output; leave it out")
+    require(not piped or encoding == BY_SUFFIX, "--codec, --crf: have no effect on the output -; leave them out")
 
 
 def settings_record(machine: Machine, selection: Selection, params: SteadyParams, written: Output) -> dict[str, Any]:
@@ -267,7 +276,8 @@ def _raw_shape(raw: str | None) -> tuple[int, ...] | None:
 class _Facts:
     """What is worth saying about a run."""
 
-    def __init__(self) -> None:
+    def __init__(self, verbose: bool) -> None:
+        self.verbose = verbose
         self.figures = SteadyFigures()
         self.let_go: list[float] = []
 
@@ -276,6 +286,9 @@ class _Facts:
     ) -> Iterator[SteadyFrame]:
         """Pass frames on, take note of them, and show progress."""
         for frame in frames:
+            if self.verbose and (frame.starts_scene or frame.sigma != self.figures.sigma):
+                what = "a scene begins; " if frame.starts_scene else ""
+                say(f"frame {frame.number}: {what}{frame.sigma:.2f} pixels of blur are removed", quiet=False)
             self.figures.scenes += frame.starts_scene
             self.figures.sigma = frame.sigma
             self.figures.displacement.append(frame.displacement)

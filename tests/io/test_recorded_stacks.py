@@ -63,7 +63,7 @@ class TestArrays:
             source = open_frames(tmp_path / "a.npy", axes=axes)
             np.testing.assert_array_equal(np.rint(source.read() * 255), frames)
             assert source.warnings == ()
-        refused(tmp_path / "a.npy", ConfigurationError, "--axes: expected letters", axes="xyt")
+        refused(tmp_path / "a.npy", ConfigurationError, "--axes: expected thw, hwt, thwc or tchw", axes="xyt")
         refused(tmp_path / "a.npy", ConfigurationError, "--axes: expected 3 letters", axes="thwc")
         write_video(tmp_path / "a.ser", np.zeros((2, 4, 5), np.float32), 25)
         refused(tmp_path / "a.ser", ConfigurationError, "--axes: has an effect on .npy", axes="thw")

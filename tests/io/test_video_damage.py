@@ -321,7 +321,7 @@ class TestDamage:
         kept = np.array(source.numbers)
         assert {*range(10), *range(20, 30)} <= set(kept) and 20 < len(kept) < 30
         np.testing.assert_array_equal(source.read(), whole[kept])
-        np.testing.assert_allclose(source.timestamps, kept / RATE, atol=1e-4)
+        np.testing.assert_allclose(source.timestamps, kept / float(RATE), atol=1e-4)
 
     @pytest.mark.parametrize("part", range(1, 9))
     def test_any_damaged_byte_of_a_slice_footer_is_found(self, tmp_path, part):
