@@ -61,7 +61,8 @@ def _heic(path: Path, data: bytes, limits: Limits) -> PixelArray:
     image = pillow_heif.open_heif(BytesIO(data), convert_hdr_to_8bit=False)
     width, height = image.size
     limits.check_size(width, height, str(path))
-    pixels = np.asarray(image)
+    # The decoder keeps the memory of what it hands out.
+    pixels = np.array(image)
     if pixels.dtype == np.uint8:
         return pixels
     # The bits of the file are the upper ones.
