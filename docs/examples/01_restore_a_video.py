@@ -128,7 +128,7 @@ for decision in result.decisions:
 # onto the mean geometry of all frames, and `recentre` does so with the centroid, which guides the deconvolution.
 
 # %%
-part = source.select(roi=(60, 60, 96, 96))
+part = source.select(roi=(60, 0, 96, 96))
 known = tr.RestoreParams(border="keep", deconvolution=tr.DeconvolutionParams(sigma=1.0))
 whole = tr.restore(part, known)
 
