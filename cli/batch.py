@@ -1,16 +1,18 @@
-"""``turbrestore batch``: many clips, side by side in processes of Dask."""
+"""``turbrestore batch``: many clips, side by side in processes of Dask, or one after the other where it is missing."""
 
 from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
 from turbrestore.core.errors import TurbrestoreError, require
+from turbrestore.core.extras import install_command
 from turbrestore.core.remarks import counted
 from turbrestore.io.limits import first_line
 from turbrestore.report.batch_page import ClipRow, thumbnail_uri
@@ -58,7 +60,7 @@ def batch(
 ) -> None:
     """Restore many clips side by side; a clip that fails is a row of the summary with its reason.
 
-    Ends with 1 if any clip failed.
+    Ends with 1 if any clip failed.  Without the extra ``distributed`` clips are restored one after the other.
 
     Parameters
     ----------
@@ -101,11 +103,11 @@ def batch(
     quiet : bool
         Print neither progress nor remarks.
     """
-    check_cluster("batch", scheduler, workers)
+    parallel = check_cluster("batch", scheduler, workers)
     inputs, out = _folder_last(inputs, out)
     clips = find_clips(inputs)
     outputs = name_outputs(clips, out, f".{format}")
-    count = 1 if scheduler else processes(len(clips), memory_limit, workers)
+    count = 1 if scheduler or not parallel else processes(len(clips), memory_limit, workers)
     each = MemorySize(memory_limit / count) if memory_limit is not None else None
     settings = dataclasses.replace(params, deconvolution=known_sigma(sigma, params.deconvolution))
     # A worker of another machine has another folder to work in.
@@ -128,7 +130,9 @@ def batch(
     ]
     with lock_folder(out):
         rows, missing = plan(orders, out, resume, overwrite)
-        _do(rows, missing, out, scheduler, count, quiet)
+        if missing and not parallel:
+            say(f"one clip after the other; {install_command('distributed')} lets them run side by side", quiet)
+        _do(rows, missing, out, scheduler, count if parallel else 0, quiet)
     failed = [row for row in rows if row.state != "done"]
     if json:
         print_json({"out": str(out), "clips": [figures(row) for row in rows]})
@@ -193,15 +197,19 @@ def _reason(error: BaseException) -> str:
 def _do(
     rows: list[ClipRow], orders: Sequence[Order], out: Path, scheduler: str | None, count: int, quiet: bool
 ) -> None:
-    """Restore what is missing; ``rows`` get what comes of it, and the journal each at once."""
+    """Restore what is missing; ``rows`` get what comes of it, and the journal each at once.
+
+    ``count`` is the number of processes to start; 0 restores one clip after the other in this one.
+    """
     places = {row.output: place for place, row in enumerate(rows)}
     try:
         with (out / JOURNAL).open("w", encoding="utf-8") as journal:
             journal.writelines(map(journal_line, rows))
             journal.flush()
             if orders:
-                with connected(scheduler, min(count, len(orders)), quiet) as client:
-                    for row in _finished(client, orders, out, quiet):
+                with nullcontext() if count == 0 else connected(scheduler, min(count, len(orders)), quiet) as client:
+                    finished = _one_by_one(orders) if client is None else _side_by_side(client, orders)
+                    for row in _told(finished, len(orders), quiet):
                         rows[places[row.output]] = row
                         journal.write(journal_line(row))
                         journal.flush()
@@ -216,32 +224,39 @@ def _do(
         write_summary(out, rows)
 
 
-def _finished(client: Client, orders: Sequence[Order], out: Path, quiet: bool) -> Iterator[ClipRow]:
+def _one_by_one(orders: Sequence[Order]) -> Iterator[ClipRow]:
+    """Restore one clip after the other, and yield the row of each."""
+    for order in orders:
+        yield _as_named(work(_placed(order)), order)
+
+
+def _side_by_side(client: Client, orders: Sequence[Order]) -> Iterator[ClipRow]:
     """Hand out all clips, and yield the row of each when it is done."""
     from distributed import as_completed
 
-    here = {str(order.output): order for order in orders}
-    absolute = [
-        dataclasses.replace(
-            order,
-            input=order.input.absolute(),
-            output=order.output.absolute(),
-            report=None if order.report is None else order.report.absolute(),
-        )
-        for order in orders
-    ]
-    futures = dict(zip(client.map(work, absolute, pure=False), orders, strict=True))
+    futures = dict(zip(client.map(work, list(map(_placed, orders)), pure=False), orders, strict=True))
+    for future in as_completed(list(futures)):
+        order = futures.pop(future)
+        yield _as_named(_row_of(future, order), order)
+
+
+def _placed(order: Order) -> Order:
+    """Name files independently of the folder that a process works in."""
+    report = None if order.report is None else order.report.absolute()
+    return dataclasses.replace(order, input=order.input.absolute(), output=order.output.absolute(), report=report)
+
+
+def _told(finished: Iterable[ClipRow], count: int, quiet: bool) -> Iterator[ClipRow]:
+    """Pass rows on, and show progress."""
     with progress_bars(quiet) as progress:
-        for number, future in enumerate(as_completed(list(futures)), 1):
-            order = futures.pop(future)
-            row = _as_named(_row_of(future, order), order)
+        for number, row in enumerate(finished, 1):
             # The journal has a clip before anybody is told that it is done.
             yield row
             if progress is not None:
-                progress("batch", number, len(here))
+                progress("batch", number, count)
             if progress is None or row.state == "failed":
                 result = row.reason if row.state == "failed" else f"{row.frames} frames in {row.seconds:.1f} s"
-                say(f"{number} of {len(here)}: {row.input}: {result}", quiet)
+                say(f"{number} of {count}: {row.input}: {result}", quiet)
 
 
 def _as_named(row: ClipRow, order: Order) -> ClipRow:

@@ -11,6 +11,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -136,7 +137,7 @@ def journal_line(row: ClipRow) -> str:
 
 
 def write_summary(out: Path, rows: Sequence[ClipRow]) -> None:
-    """Write the table and the page of a batch, in place of earlier ones."""
+    """Write the table and the page of a batch, in place of earlier ones; the page where its package is there."""
     table = io.StringIO(newline="")
     writer = csv.DictWriter(table, _COLUMNS, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -144,6 +145,10 @@ def write_summary(out: Path, rows: Sequence[ClipRow]) -> None:
         done = row.state == "done"
         writer.writerow({name: value if done or isinstance(value, str) else "" for name, value in figures(row).items()})
     atomic_write(out / TABLE, table.getvalue().encode(errors="replace"), overwrite=True)
+    if find_spec("jinja2") is None:
+        # That of an earlier batch would show other clips.
+        (out / PAGE).unlink(missing_ok=True)
+        return
     write_batch_page(out / PAGE, rows)
 
 

@@ -33,13 +33,14 @@ _SETTINGS = {
 }
 
 
-def check_cluster(command: str, scheduler: str | None, workers: int | None) -> None:
-    """Refuse options that make no sense, and say which package is missing."""
-    for package in ("distributed", "jinja2"):
-        if find_spec(package) is None:
-            raise missing_package(command, package, "distributed")
+def check_cluster(command: str, scheduler: str | None, workers: int | None) -> bool:
+    """Refuse options that make no sense or lack a package; return whether there can be other processes."""
+    there = find_spec("distributed") is not None
+    if not there and (scheduler is not None or workers is not None):
+        raise missing_package(command, "distributed", "distributed")
     require(workers is None or workers >= 1, f"--workers: expected at least 1, found {workers}")
     require(workers is None or scheduler is None, "--workers: has no effect with --scheduler; leave it out")
+    return there
 
 
 @contextmanager

@@ -7,13 +7,21 @@ import logging
 import os
 import sys
 
-from cyclopts import App, CycloptsError, MissingArgumentError, UnknownCommandError, UnusedCliTokensError
+from cyclopts import (
+    App,
+    CycloptsError,
+    MissingArgumentError,
+    UnknownCommandError,
+    UnknownOptionError,
+    UnusedCliTokensError,
+)
 
 from turbrestore import __version__
 from turbrestore.core.errors import ConfigurationError, StorageError, TurbrestoreError
 
 from .examples import EXAMPLES, FIRST_STEPS, epilogue
 from .help import EVERYTHING, Formatter
+from .hints import unknown_option, with_meaning
 from .overview import COMMANDS, MOMENTS, SUMMARY
 from .settings import settings_file
 from .signals import INTERRUPTED
@@ -97,7 +105,7 @@ def run(words: list[str]) -> int:
         silence(sys.stdout)
     except (CycloptsError, TurbrestoreError, KeyboardInterrupt, OSError, MemoryError) as error:
         message, code = explain(error)
-        tell(f"turbrestore: {' '.join(as_typed(message, words).split())}")
+        tell(f"turbrestore: {' '.join(with_meaning(as_typed(message, words), words).split())}")
         return code
     return 0
 
@@ -142,6 +150,8 @@ def _misuse(error: CycloptsError) -> str:
     if isinstance(error, MissingArgumentError) and error.argument is not None:
         command = " ".join(["turbrestore", *(error.command_chain or ())])
         return f"{error.argument.name}: expected a value, found none; {command} --help says what is expected"
+    if isinstance(error, UnknownOptionError):
+        return unknown_option(error)
     if isinstance(error, UnknownCommandError) and error.unused_tokens and "Did you mean" not in str(error):
         return f"{error.unused_tokens[0]}: no such command; turbrestore --help lists them"
     return str(error)
@@ -155,6 +165,7 @@ def as_typed(message: str, words: list[str]) -> str:
     fitting = [option for option in typed if option.removeprefix("--").rpartition(".")[2] == wanted]
     if len(fitting) == 1:
         message = f"{fitting[0]}{colon}{rest}"
+    message = message.replace("allow damaged ones to be skipped", "add --skip-damaged")
     return message.replace("allow overwriting", "add --overwrite")
 
 

@@ -47,6 +47,7 @@ EXTRAS = {
     "jinja2": "report",
     "astropy": "fits",
     "rawpy": "raw",
+    "pillow_heif": "heic",
     "distributed": "distributed",
     "nicegui": "app",
     "napari": "napari",

@@ -17,7 +17,17 @@ EVERYTHING = "--help-all"
 # Options without a dot that few people need; those with a dot are settings of a stage.
 RARE = {
     *("--strict", "--skip-damaged", "--max-pixels", "--checkpoint-every", "--uncertainty", "--truth", "--until"),
-    *("--tile", "--scheduler", "--workers", "--threads", "--static-mask", "--reference", "--like", "--derotate"),
+    *(
+        "--tile",
+        "--scheduler",
+        "--workers",
+        "--threads",
+        "--static-mask",
+        "--reference",
+        "--like",
+        "--derotate",
+        "--axes",
+    ),
     *("--inner-scale", "--outer-scale", "--layers", "--pupil-samples", "--field-spacing", "--sub-frames"),
     *("--channel-wavelengths", "--nyquist"),
 }

@@ -49,6 +49,7 @@ def open_checked(input: Path, selection: Selection) -> tuple[FrameSource, Conten
         skip_damaged=selection.skip_damaged,
         bayer=selection.bayer,
         hdr=selection.hdr,
+        axes=selection.axes,
     )
     source = _calibrated(source, selection)
     if selection.crop_to_object:

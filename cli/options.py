@@ -49,6 +49,8 @@ class Selection:
         Frames of an even surface.  A video, an image or a folder; their mean is divided out.
     crop_to_object : bool
         Follow a planet on a dark field.  Any bright object there will do; the window just holds it.
+    axes : str, optional
+        Order of the axes of a .npy array: thw, hwt, thwc, tchw or hwct.  By default the array tells.
     derotate : str, optional
         Turn the surface of a planet back to the middle of the clip: jupiter, mars, saturn or a period in hours, and
         perhaps the angle of the equator in the image and the latitude of the middle of the disc in degrees, such as
@@ -65,6 +67,7 @@ class Selection:
     dark: str | None = None
     flat: str | None = None
     crop_to_object: Flag = False
+    axes: str | None = None
     derotate: str | None = None
 
     def frame_range(self) -> FrameRange | None:

@@ -13,8 +13,8 @@ from typing import TypeVar
 
 Item = TypeVar("Item")
 
-# Windows knows no SIGHUP.
-NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
+# Windows knows no SIGHUP, and alone a SIGBREAK, that of Ctrl-Break.
+NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
 # Shells add the number of the signal to this.
 ENDED_BY_SIGNAL = 128
 INTERRUPTED = 130

@@ -82,6 +82,7 @@ def steady(
     overwrite: Flag = False,
     json: Flag = False,
     quiet: Flag = False,
+    verbose: Flag = False,
     params: Annotated[SteadyParams, Parameter(name="*")] = SteadyParams(),
 ) -> None:
     """Steady and sharpen a video; what moves keeps moving.
@@ -113,17 +114,18 @@ def steady(
         Print the facts of the run as JSON.  They go to standard output.
     quiet : bool
         Print neither progress nor remarks.
+    verbose : bool
+        Say where scenes begin and how much blur is removed from then on.
     """
     piped_in, piped_out = str(input) == "-", str(output) == "-"
     is_camera = re.fullmatch(r"/dev/video\d+", str(input)) is not None
     streamed = piped_in or is_camera
     encoding, shape = written.encoding(), _raw_shape(raw)
     require(raw is None or piped_in, "--raw: has no effect unless the input is -; leave it out")
-    require(not (piped_out and json), "--json: contradicts the output -, which is standard output; leave it out")
-    require(not piped_out or encoding == BY_SUFFIX, "--codec, --crf: have no effect on the output -; leave them out")
     require(
         not (report and (streamed or piped_out)), "--report: compares two files, and a stream is none; leave it out"
     )
+    _check_printed(encoding, json, quiet and verbose, piped_out)
     _check_depth(written, output, piped_out and raw is not None)
     inputs = files_read(selection, None if streamed else input, config)
     settings_path = output.with_name(output.name + ".toml")
@@ -135,9 +137,9 @@ def steady(
     source = _from_stream(input, selection, shape) if streamed else _from_file(input, selection, quiet)
     fps, depth = source.fps or USUAL_RATE, source.bit_depth if written.bit_depth is None else written.bit_depth
     companion = source.frames if isinstance(source.frames, FrameSource) else None
-    if companion is not None and companion.colour is not None and companion.colour[1] in CURVES:
-        encoding = _encoding_of_hdr(encoding, output)
-    facts, started = _Facts(), time.monotonic()
+    encoding = _encoding_for(companion, encoding, output)
+    _tell_lost_bits(source, written, encoding, output, quiet or piped_out)
+    facts, started = _Facts(verbose), time.monotonic()
     with tempfile.TemporaryFile() as masks:
         with progress_bars(quiet) as progress:
             total = len(companion) if companion is not None else 0
@@ -168,14 +170,23 @@ def steady(
         say(f"{output}: {facts.text()}", quiet)
 
 
+def _check_printed(encoding: Encoding, json: bool, is_torn: bool, piped: bool) -> None:
+    """Refuse options about what is printed that contradict each other, or a video on standard output."""
+    require(not is_torn, "--verbose: contradicts --quiet; leave one of them out")
+    require(not (piped and json), "--json: contradicts the output -, which is standard output; leave it out")
+    require(not piped or encoding == BY_SUFFIX, "--codec, --crf: have no effect on the output -; leave them out")
+
+
 def settings_record(machine: Machine, selection: Selection, params: SteadyParams, written: Output) -> dict[str, Any]:
     """All settings of a run, as in a settings file; None where they are left to be measured."""
     records = (machine, selection, params, written)
     return {name: value for record in records for name, value in dataclasses.asdict(record).items()}
 
 
-def _encoding_of_hdr(encoding: Encoding, output: Path) -> Encoding:
-    """HEVC of 10 bits for HDR in .mp4: H.264 has 8 bits, in which codes of HLG and PQ show bands."""
+def _encoding_for(source: FrameSource | None, encoding: Encoding, output: Path) -> Encoding:
+    """Choose HEVC of 10 bits for HDR in .mp4: H.264 has 8 bits, in which codes of HLG and PQ show bands."""
+    if source is None or source.colour is None or source.colour[1] not in CURVES:
+        return encoding
     suffix = output.suffix.lower()
     is_h264 = suffix in (".mp4", ".mkv") and encoding.codec is None and encoding.codec_of(suffix) == "h264"
     return dataclasses.replace(encoding, codec="hevc") if is_h264 else encoding
@@ -232,11 +243,24 @@ def _check_depth(written: Output, output: Path, raw: bool) -> None:
         return
     check_depth(depth)
     require(not raw, "--bit-depth: has no effect on raw frames, which have 8 bits; leave it out")
-    kind = written.encoding().codec_of(suffix) if suffix in (".mkv", ".mp4") else suffix
+    kind = _kind(written.encoding(), suffix)
     most = _MOST_BITS.get(kind, depth)
     require(
         depth <= most, f"--bit-depth: expected at most {most}, as {kind} has, found {depth}; .mkv by default has 16"
     )
+
+
+def _kind(encoding: Encoding, suffix: str) -> str:
+    """Codec of an output, or its suffix where that is its format."""
+    return encoding.codec_of(suffix) if suffix in (".mkv", ".mp4") else suffix
+
+
+def _tell_lost_bits(source: _Source, written: Output, encoding: Encoding, output: Path, quiet: bool) -> None:
+    """Say that the output holds fewer bits than the input, where nobody has asked for that."""
+    kind = _kind(encoding, output.suffix.lower())
+    most = _MOST_BITS.get(kind, source.bit_depth)
+    if written.bit_depth is None and source.bit_depth > most:
+        say(f"{output}: {kind} holds {most} of the {source.bit_depth} bits of the input; .mkv by default has 16", quiet)
 
 
 def _raw_shape(raw: str | None) -> tuple[int, ...] | None:
@@ -252,7 +276,8 @@ def _raw_shape(raw: str | None) -> tuple[int, ...] | None:
 class _Facts:
     """What is worth saying about a run."""
 
-    def __init__(self) -> None:
+    def __init__(self, verbose: bool) -> None:
+        self.verbose = verbose
         self.figures = SteadyFigures()
         self.let_go: list[float] = []
 
@@ -261,6 +286,9 @@ class _Facts:
     ) -> Iterator[SteadyFrame]:
         """Pass frames on, take note of them, and show progress."""
         for frame in frames:
+            if self.verbose and (frame.starts_scene or frame.sigma != self.figures.sigma):
+                what = "a scene begins; " if frame.starts_scene else ""
+                say(f"frame {frame.number}: {what}{frame.sigma:.2f} pixels of blur are removed", quiet=False)
             self.figures.scenes += frame.starts_scene
             self.figures.sigma = frame.sigma
             self.figures.displacement.append(frame.displacement)

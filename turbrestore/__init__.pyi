@@ -47,6 +47,7 @@ from .registration.flow import FlowParams as FlowParams
 from .registration.flow import estimate_flow as estimate_flow
 from .registration.flow_algebra import compose_flows as compose_flows
 from .registration.flow_algebra import invert_flow as invert_flow
+from .registration.recentring import recentre as recentre
 from .report import write_report as write_report
 from .results import Restoration as Restoration
 from .results import Verdict as Verdict

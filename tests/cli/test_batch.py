@@ -23,7 +23,7 @@ from turbrestore.io.video import open_frames, write_video
 from turbrestore.report.batch_page import ClipRow, render_batch
 from turbrestore.runtime.runtime import Runtime
 from turbrestore_cli import batch as command
-from turbrestore_cli import cluster
+from turbrestore_cli import batch_plan, cluster
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.batch_plan import find_clips, journal_line, name_outputs, read_journal
 from turbrestore_cli.inputs import open_input
@@ -253,9 +253,19 @@ class TestBatch:
         captured = capsys.readouterr()
         assert captured.out == "" and captured.err.count("\n") == 1 and part in captured.err
 
-    def test_without_the_extra(self, clips, tmp_path, capsys, monkeypatch):
-        monkeypatch.setattr(cluster, "find_spec", lambda name: None)
-        assert main(["batch", str(clips / "0.mkv"), "--out", str(tmp_path / "out")]) == 2
+    def test_without_the_extra_clips_are_restored_one_after_the_other(self, clips, tmp_path, capsys, monkeypatch):
+        for module in (cluster, batch_plan):
+            monkeypatch.setattr(module, "find_spec", lambda name: None)
+        monkeypatch.setattr(command, "connected", None)
+        (tmp_path / "0.mkv").write_bytes(b"no video")
+        words = [str(tmp_path / "0.mkv"), str(clips / "1.mkv"), str(clips / "2.mkv"), str(tmp_path / "out")]
+        assert main(["batch", *words, *QUICK]) == 1
+        told = capsys.readouterr().err.splitlines()
+        assert told[0].startswith("turbrestore: one clip after the other; pip install 'distributed")
+        assert [line.split(":")[1] for line in told[1:4]] == [f" {number} of 3" for number in (1, 2, 3)]
+        assert [row["state"] for row in rows(tmp_path / "out")] == ["failed", "done", "done"]
+        assert not (tmp_path / "out" / "index.html").exists()
+        assert main(["batch", *words, "--workers", "2"]) == 2
         assert "pip install 'distributed" in capsys.readouterr().err
 
 

@@ -86,6 +86,25 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, make, code, par
 
 
 @pytest.mark.parametrize(
+    ("word", "told"),
+    [
+        ("http://host//a.mkv", "http://host//a.mkv: no such file or folder; addresses are not opened"),
+        ("-", "-: no such file or folder; steady alone reads and writes standard streams"),
+        ("night/*.ser", "night/*.ser: no such file or folder; batch takes patterns"),
+        ("./frame%03d.png", "./frame%03d.png: no such file or folder; a series of images is read by the name of its"),
+        ("-/-a.mkv", "-/-a.mkv: taken for an option; write ./-/-a.mkv, or --"),
+        ("a//b.mkv", "a//b.mkv: no such file or folder\n"),
+    ],
+)
+def test_a_word_is_shown_as_typed_with_what_it_may_mean(run, tmp_path, monkeypatch, word, told):
+    monkeypatch.chdir(tmp_path)
+    fails(run("info", word), 2 if word == "-/-a.mkv" else 66, told)
+    # A file of that name is read.
+    (tmp_path / "-a.mkv").write_bytes(b"")
+    fails(run("info", "--", "-a.mkv"), 65, "-a.mkv: ")
+
+
+@pytest.mark.parametrize(
     ("words", "code", "part"),
     [
         (["--smoothnes", "3"], 2, "--smoothnes"),

@@ -39,6 +39,13 @@ def test_output_has_the_frames_of_the_input(run, tmp_path, suffix):
     assert open_frames(output).shape[:3] == (6, 48, 64)
 
 
+def test_bits_that_the_output_does_not_hold_are_named(run, tmp_path):
+    write_video(tmp_path / "a.mkv", np.random.default_rng(0).uniform(0, 1, (3, 20, 32)).astype(np.float32), 25, 10)
+    for name, told in {"b.mp4": 1, "b.mkv": 0}.items():
+        code, _, err = run("steady", tmp_path / "a.mkv", tmp_path / name, "--sigma", "0")
+        assert code == 0 and err.count("h264 holds 8 of the 10 bits of the input") == told
+
+
 def test_settings_repeat_the_run(run, tmp_path):
     first, second = tmp_path / "a.npy", tmp_path / "b.npy"
     assert run("steady", SAMPLE, first, *PART, "--camera", "lock", "--sigma", "1.1", "--bit-depth", "32")[0] == 0

@@ -1,7 +1,6 @@
 """Still images: exact round trips, refusals in one line, and nothing left behind."""
 
 import os
-import resource
 import stat
 import struct
 import zlib
@@ -303,6 +302,7 @@ def test_interrupted_writing_leaves_everything_as_it_was(tmp_path, error, exists
 
 
 def test_full_disk_is_a_storage_error_and_leaves_nothing(tmp_path):
+    resource = pytest.importorskip("resource")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
     try:

@@ -1,14 +1,16 @@
 """Arrays, stacks and folders as programs and phones write them: axes, channels, white, turns, thumbnails."""
 
+import cv2
 import numpy as np
 import PIL.Image
 import pytest
 import tifffile
 
-from turbrestore.core.errors import DataError
+from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.footage.checks.content import check_content
-from turbrestore.io.images import read_image
-from turbrestore.io.video import open_frames
+from turbrestore.io.images import read_image, read_pixels
+from turbrestore.io.pixels import upright
+from turbrestore.io.video import open_frames, write_video
 from videos import refused, scene
 
 COLOUR = np.stack(scene(14, 40, 56))
@@ -24,7 +26,7 @@ class TestArrays:
         source = open_frames(tmp_path / "a.npy")
         np.testing.assert_array_equal(np.rint(source.read() * 255), frames)
         (remark,) = source.warnings
-        assert "(H, W, T)" in remark and "save it" in remark
+        assert "(H, W, T)" in remark and "--axes thw" in remark
 
     @pytest.mark.parametrize(
         ("order", "axes"), [((0, 3, 1, 2), "(T, 3, H, W)"), ((1, 2, 3, 0), "(H, W, 3, T)")], ids=["TCHW", "HWCT"]
@@ -39,6 +41,32 @@ class TestArrays:
     def test_one_channel(self, tmp_path, axis):
         np.save(tmp_path / "a.npy", np.expand_dims(STILL, axis))
         assert open_frames(tmp_path / "a.npy").shape == STILL.shape
+
+    @pytest.mark.parametrize("light", ["steady", "bracketed", "stepped", "fading"])
+    @pytest.mark.parametrize("last", [False, True], ids=["THW", "HWT"])
+    def test_light_that_changes_does_not_change_the_order(self, tmp_path, light, last):
+        gains = {"steady": np.ones(12), "bracketed": np.tile([0.25, 0.5, 1], 4), "fading": np.linspace(1, 0.08, 12)}
+        gain = {**gains, "stepped": np.repeat([1, 0.3], 6)}[light]
+        rng = np.random.default_rng(3)
+        scene = cv2.GaussianBlur(rng.uniform(0, 1, (40, 56)), (0, 0), 1.5)
+        frames = np.uint8(255 * np.clip((scene + rng.normal(0, 0.02, (12, 40, 56))) * gain[:, None, None], 0, 1))
+        np.save(tmp_path / "a.npy", np.moveaxis(frames, 0, 2 * last))
+        source = open_frames(tmp_path / "a.npy")
+        np.testing.assert_array_equal(np.rint(source.read() * 255), frames)
+        assert len(source.warnings) == last
+
+    def test_axes_that_are_named(self, tmp_path):
+        for axes in ("thwc", "tchw", "HWCT", "hwt"):
+            names = axes.lower()
+            frames = COLOUR if "c" in names else STILL
+            np.save(tmp_path / "a.npy", np.transpose(frames, ["thwc".index(name) for name in names]))
+            source = open_frames(tmp_path / "a.npy", axes=axes)
+            np.testing.assert_array_equal(np.rint(source.read() * 255), frames)
+            assert source.warnings == ()
+        refused(tmp_path / "a.npy", ConfigurationError, "--axes: expected thw, hwt, thwc or tchw", axes="xyt")
+        refused(tmp_path / "a.npy", ConfigurationError, "--axes: expected 3 letters", axes="thwc")
+        write_video(tmp_path / "a.ser", np.zeros((2, 4, 5), np.float32), 25)
+        refused(tmp_path / "a.ser", ConfigurationError, "--axes: has an effect on .npy", axes="thw")
 
     def test_usual_orders_have_no_remark(self, tmp_path):
         rng = np.random.default_rng(0)
@@ -78,6 +106,14 @@ class TestTiff:
         tifffile.imwrite(tmp_path / "a.tif", STILL, imagej=True, metadata={"axes": axes})
         assert open_frames(tmp_path / "a.tif").shape == STILL.shape
 
+    @pytest.mark.parametrize("orientation", range(1, 9))
+    def test_stacks_are_turned_upright(self, tmp_path, orientation):
+        with tifffile.TiffWriter(tmp_path / "a.tif") as tiff:
+            for frame in STILL:
+                tiff.write(frame, extratags=[(274, "H", 1, orientation, True)], metadata=None, contiguous=False)
+        expected = np.stack([upright(frame, orientation) for frame in STILL])
+        np.testing.assert_array_equal(np.rint(open_frames(tmp_path / "a.tif").read() * 255), expected)
+
     def test_lzw(self, tmp_path):
         pages = [PIL.Image.fromarray(frame) for frame in STILL]
         pages[0].save(tmp_path / "a.tif", save_all=True, append_images=pages[1:], compression="tiff_lzw")
@@ -110,6 +146,14 @@ class TestFolders:
         found = open_frames(tmp_path).read()
         np.testing.assert_allclose(found[1], np.roll(values, 1) / white, atol=0.003 if white < 256 else 1e-5)
         assert read_image(tmp_path / "0.pgm").image.max() == 1
+
+    @pytest.mark.parametrize(("white", "kind"), [(9, "uint8"), (255, "uint8"), (900, "uint16")])
+    def test_text_maps_may_end_without_a_new_line(self, tmp_path, white, kind):
+        (tmp_path / "a.pgm").write_bytes(b"P2 3 2 %d\n0 1 2\n3 4 %d" % (white, white))
+        pixels, _ = read_pixels(tmp_path / "a.pgm")
+        full = np.iinfo(kind).max
+        np.testing.assert_array_equal(pixels, np.rint(np.array([[0, 1, 2], [3, 4, white]]) * full / white))
+        assert pixels.dtype == kind
 
     @pytest.mark.parametrize("name", ["thumb.png", "0.png", "9.png", "5a.png"])
     def test_the_image_that_is_no_frame_is_named(self, tmp_path, name):

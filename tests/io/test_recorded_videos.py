@@ -1,5 +1,6 @@
 """Videos as cameras record them: turned, in any container, with pixels that are not square, begun in the middle."""
 
+import os
 from pathlib import Path
 
 import av
@@ -7,8 +8,10 @@ import numpy as np
 import pytest
 
 from turbrestore.core.errors import DataError
-from turbrestore.io.video import open_frames
+from turbrestore.io.video import open_frames, write_video
 from videos import encode, refused, scene
+
+FRAMES = scene()
 
 ONE = 65536
 # Display matrix (a, b, c, d) by what a player does to a frame: a pixel x, y is shown at a x + c y, b x + d y.
@@ -102,3 +105,25 @@ def test_recordings_that_begin_in_the_middle(tmp_path, suffix):
         count = sum(1 for _ in container.decode(video=0))
     assert len(list(source)) == len(source) == count > 8
     assert "cannot be decoded" in source.warnings[0]
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [(".h264", "libx264"), (".265", "libx265")])
+def test_elementary_streams_have_all_their_frames(tmp_path, suffix, codec):
+    kind = "h264" if codec == "libx264" else "hevc"
+    encode(tmp_path / f"a{suffix}", FRAMES, codec, "yuv420p", "rgb24", muxer=kind, crf="16")
+    # Network recorders call anything a transport stream.
+    (tmp_path / "b.ts").write_bytes((tmp_path / f"a{suffix}").read_bytes())
+    for name in (f"a{suffix}", "b.ts"):
+        found = open_frames(tmp_path / name).read()
+        assert found.shape == (12, 48, 64, 3)
+        assert [np.argmin(np.abs(np.float32(FRAMES) / 255 - one).mean(axis=(1, 2, 3))) for one in found] == [*range(12)]
+
+
+@pytest.mark.parametrize(
+    ("true", "named"), [(".ser", "a.avi"), (".npy", "a.mp4"), (".tif", "a.png"), (".mkv", "a.tif")]
+)
+def test_the_content_counts_where_the_suffix_lies(tmp_path, true, named):
+    frames = np.float32(FRAMES)[..., 0] / 255
+    write_video(tmp_path / f"a{true}", frames, 25)
+    os.replace(tmp_path / f"a{true}", tmp_path / named)  # noqa: PTH105
+    np.testing.assert_array_equal(open_frames(tmp_path / named).read(), frames)

@@ -1,7 +1,5 @@
 """Videos out."""
 
-import resource
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -127,6 +125,7 @@ class TestWriting:
     @pytest.mark.parametrize("name", ["a.mkv", "a.npy", "a.tif", "a.ser"])
     def test_full_disk_is_a_storage_error(self, tmp_path, name):
         noise = np.random.default_rng(0).random((8, 64, 64), dtype=np.float32)
+        resource = pytest.importorskip("resource")
         limits = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (8192, limits[1]))
         try:

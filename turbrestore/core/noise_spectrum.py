@@ -69,7 +69,7 @@ def fit_noise_spectrum(differences: Iterable[FloatArray], scene: FloatArray) -> 
     """Fit N and e to differences, each (H, W), of images of one scene (H, W); see the docstring of the module."""
     of_scene = window_powers(scene)
     powers = [window_powers(difference) for difference in differences]
-    usual = np.quantile(powers, _QUARTILE, axis=0) / _quartile_of_noise(len(powers))
+    usual = np.quantile(np.array(powers), _QUARTILE, axis=0) / _quartile_of_noise(len(powers))
     found = np.array([_fit_ring(ring, m) for ring, m in zip(usual.T, of_scene.T, strict=True)])
     # The mean of each window is taken out, which leaves half of the lowest ring.
     found[0] = found[1]

@@ -98,15 +98,23 @@ class FlowDynamics:
         """
         return plot_dynamics(self.singular_values, self.eigenvalues)
 
+    def __repr__(self) -> str:
+        height, width = self.shape
+        facts = [*self._facts(), *(("note", note) for note in self.notes)]
+        return "\n".join([f"FlowDynamics: {width}×{height} pixels", *(f"{name}: {value}" for name, value in facts)])
+
     def _repr_html_(self) -> str:
         spread = np.sqrt(self.flow_variance).astype(np.float32)
-        facts = [
+        return preview("Flow dynamics", self._facts(), spread / max(float(spread.max()), 1e-6))
+
+    def _facts(self) -> list[tuple[str, str]]:
+        spread = np.sqrt(self.flow_variance)
+        return [
             ("states", f"{self.rank}, from {self.frame_count} flows"),
             ("share of the motion", f"{100 * self.energy_share:.1f} %"),
             ("largest eigenvalue", f"{np.abs(self.eigenvalues).max(initial=0.0):.3f}"),
-            ("motion", f"{spread.mean():.2f} pixels a component, brightest {spread.max():.2f}"),
+            ("motion", f"{spread.mean():.2f} pixels a component, largest {spread.max():.2f}"),
         ]
-        return preview("Flow dynamics", facts, spread / max(float(spread.max()), 1e-6))
 
     @property
     def rank(self) -> int:

@@ -26,12 +26,14 @@ from ..core.remarks import Doubt
 from .astronomy.fits import read_fits
 from .astronomy.fits_header import FITS_SUFFIXES, is_fits
 from .astronomy.fits_output import write_fits
+from .coded_images import CODED_SUFFIXES, decode_coded
 from .counts import holds_counts, range_of_counts
-from .limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
+from .limits import DEFAULT_LIMITS, Limits, check_input, content_suffix, first_line, input_errors
 from .output import atomic_output, atomic_write, check_output, check_space, frames_of_one_size
 from .pixels import (
     ORIENTATION_TAG,
     PixelArray,
+    at_full_range,
     at_levels,
     check_depth,
     depth_of,
@@ -47,7 +49,19 @@ from .tiff import TIFF_SUFFIXES, read_tiff
 if TYPE_CHECKING:
     import PIL.Image
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp", *RAW_SUFFIXES)
+IMAGE_SUFFIXES = (
+    ".png",
+    ".jpg",
+    ".jpeg",
+    ".tif",
+    ".tiff",
+    ".bmp",
+    ".pgm",
+    ".ppm",
+    ".webp",
+    *CODED_SUFFIXES,
+    *RAW_SUFFIXES,
+)
 ANIMATION_SUFFIXES = (".png", ".apng", ".webp")
 ANIMATION_OUTPUT_SUFFIXES = (".gif", ".webp")
 # Bytes of a PNG file that state its bits a channel and its type of colour; that of grey with alpha.
@@ -73,7 +87,8 @@ def read_image(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) ->
     Parameters
     ----------
     path : path-like
-        PNG, JPEG, TIFF (one page), BMP, PGM, PPM, WebP, raw or FITS file. Of an animation the first frame is read.
+        PNG, JPEG, TIFF (one page), BMP, PGM, PPM, WebP, AVIF, HEIC, JPEG 2000, JPEG XL, DPX, EXR, raw or FITS file.
+        Of an animation the first frame is read.
     limits : Limits
         Largest image that is read.
 
@@ -88,7 +103,7 @@ def read_image(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS) ->
     DataError
         Not an image, damaged, too large, a TIFF file of several pages, or values outside [0, 1].
     ConfigurationError
-        A raw or FITS file, and rawpy or Astropy is not installed.
+        A raw, HEIC or FITS file, and rawpy, pillow-heif or Astropy is not installed.
     StorageError
         The file cannot be read.
 
@@ -125,7 +140,10 @@ def read_pixels(
     if suffix in RAW_SUFFIXES:
         return read_raw_file(path, limits, like), ()
     data = _read_file(path, limits)
-    if suffix in TIFF_SUFFIXES:
+    kind = content_suffix(data) or suffix
+    if kind in CODED_SUFFIXES:
+        return without_alpha(decode_coded(path, kind, data, limits))
+    if kind in TIFF_SUFFIXES:
         pixels, notes = read_tiff(path, data, limits)
         return (pixels, notes) if pixels is not None else without_alpha(_opencv_pixels(path, data))
     return without_alpha(_decoded(path, data, limits))
@@ -290,11 +308,14 @@ def _decoded(path: Path, data: bytes, limits: Limits) -> PixelArray:
         kind, orientation = image.format, image.getexif().get(ORIENTATION_TAG)
         target = "RGBA" if image.mode == "P" and "transparency" in image.info else "RGB"
         pixels = np.array(image.convert(target) if image.mode in _OTHER_COLOURS else image)
-    if kind == "PPM" or (kind == "PNG" and data[_PNG_DEPTH] == 16):
+    white = _netpbm_white(data) if kind == "PPM" else 0
+    if white > np.iinfo(np.uint8).max:
+        # OpenCV does not end a number that the file ends with.
+        pixels = at_full_range(_opencv_pixels(path, data + b"\n"), white)
+    elif kind == "PNG" and data[_PNG_DEPTH] == 16:
         pixels = _opencv_pixels(path, data)
         # OpenCV returns grey with alpha as RGBA.
-        pixels = pixels[..., [0, 3]] if kind == "PNG" and data[_PNG_COLOUR] == _GREY_ALPHA else pixels
-        pixels = _at_full_range(pixels, data) if kind == "PPM" else pixels
+        pixels = pixels[..., [0, 3]] if data[_PNG_COLOUR] == _GREY_ALPHA else pixels
     if pixels.dtype == bool:
         pixels = np.uint8(255) * pixels
     return upright(pixels, orientation)
@@ -313,13 +334,10 @@ def _animation_frames(path: Path, data: bytes, places: Iterable[int]) -> Iterato
             yield pixels, float(image.info.get("duration", 0))
 
 
-def _at_full_range(pixels: PixelArray, data: bytes) -> PixelArray:
-    """Spread the values of a PGM or PPM file, whose header names its white, over the range of their type."""
+def _netpbm_white(data: bytes) -> int:
+    """Value of white in the header of a PGM or PPM file, of which Pillow reads those up to 255 at full range."""
     header = re.match(rb"P[2356]\s+" + rb"(?:#[^\n]*\n\s*)*\d+\s+" * 2 + rb"(?:#[^\n]*\n\s*)*(\d+)", data)
-    full, white = np.iinfo(pixels.dtype).max, int(header[1]) if header else 0
-    if not 0 < white < full:
-        return pixels
-    return np.rint(np.minimum(pixels, white) * (full / white)).astype(pixels.dtype)
+    return int(header[1]) if header else 0
 
 
 def _opencv_pixels(path: Path, data: bytes) -> PixelArray:

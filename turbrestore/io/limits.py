@@ -18,6 +18,28 @@ _NOT_FILES = {
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
 }
+# Where the first bytes of a file have a mark, and the suffix of the format that has it.
+_SIGNATURES = (
+    (0, b"\x89PNG\r\n", ".png"),
+    (0, b"\xff\xd8\xff", ".jpg"),
+    (0, b"II*\0", ".tif"),
+    (0, b"MM\0*", ".tif"),
+    (0, b"II+\0", ".tif"),
+    (0, b"MM\0+", ".tif"),
+    (0, b"\x93NUMPY", ".npy"),
+    (0, b"LUCAM-RECORDER", ".ser"),
+    (0, b"SIMPLE  =", ".fits"),
+    (0, b"GIF8", ".gif"),
+    (0, b"\x1aE\xdf\xa3", ".mkv"),
+    (8, b"WEBP", ".webp"),
+    (8, b"AVI ", ".avi"),
+    (0, b"v/1\x01", ".exr"),
+    (0, b"SDPX", ".dpx"),
+    (0, b"XPDS", ".dpx"),
+    (4, b"JXL ", ".jxl"),
+    (4, b"jP  ", ".jp2"),
+    (0, b"\xff\x4f\xff\x51", ".j2k"),
+)
 
 
 @dataclass(frozen=True)
@@ -120,6 +142,16 @@ def check_input(path: Path) -> os.stat_result:
     if kind is not None:
         raise DataError(f"{path}: expected a file, found {kind}; copy its content to a file")
     return status
+
+
+def content_suffix(head: bytes) -> str | None:
+    """Suffix of the format that the first bytes of a file tell; None where they tell none."""
+    if head[4:8] == b"ftyp":
+        # The brand of the file, and those that it is compatible with.
+        brands = head[8 : min(64, int.from_bytes(head[:4], "big"))]
+        still = brands[:4] in (b"mif1", b"avif", b"heic", b"heix", b"heim", b"heis")
+        return (".avif" if b"avif" in brands else ".heic") if still else ".mp4"
+    return next((suffix for start, mark, suffix in _SIGNATURES if head.startswith(mark, start)), None)
 
 
 def first_line(error: BaseException) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import CHANNELS, FloatArray, from_unit_to_type
-from ..core.errors import DataError
+from ..core.errors import DataError, require
 from ..core.remarks import Doubt
 from ..runtime.scratch import iter_parts, new_stack
 from .counts import source_of_numbers
@@ -29,9 +29,9 @@ from .source import FrameSource
 
 # Arrays of more bytes may be read to a scratch file.
 _LARGE = 1 << 22
-# Places along each axis at which the order of the axes is judged, and the factor by which the mean over time has more
-# contrast than the mean over rows; by the larger one where the air changes frames more than rows differ.
-_SAMPLES, _STILLER, _FAR_STILLER = 48, 1.2, 1.6
+# Places along each axis at which the order of the axes is judged, and how much more alike planes must be to be taken
+# for the frames: those of 40 clips were more alike than the planes of their last axis, by a factor of 1.04 or more.
+_SAMPLES, _MORE_ALIKE = 48, 1.1
 # Frames have no shorter side.
 _LEAST_SIDE = 16
 # Planes of at most this share of the median contrast show nothing.
@@ -123,18 +123,34 @@ class MappedFrames:
             yield np.ndarray(shape, self.dtype, piece, strides=strides)
 
 
-def open_npy(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
+def open_npy(path: Path, limits: Limits = DEFAULT_LIMITS, axes: str | None = None) -> FrameSource:
     """Open an array of shape (T, H, W) or (T, H, W, 3) as a video; the errors are those of :func:`map_npy`.
 
-    Other orders of the axes are told by the shape, and (H, W, T) by the content: the frames of a video resemble each
-    other more than its rows do.  A warning says how such an array was read.
+    Other orders of the axes are those that ``axes`` names, such as ``hwt``.  Without it they are told by the shape, and
+    (H, W, T) by the content: the frames of a video resemble each other more than its rows do.  A warning says how such
+    an array was read.
     """
-    array, order = _frames_first(path, map_npy(path))
-    remark = Doubt(f"its axes are taken for {order}; save it as (T, H, W) or (T, H, W, 3) if that is wrong")
+    whole = map_npy(path)
+    array, order = _frames_first(path, whole) if axes is None else (_named_order(path, whole, axes), "")
+    usual = "--axes thw" if whole.ndim == 3 else "--axes thwc"
+    remark = Doubt(f"its axes are taken for {order}; {usual} reads them in the usual order")
     notes = (remark,) if order else ()
     return source_of_numbers(
         path, f"npy/{array.dtype}", array.shape, array.dtype, MappedFrames.of(array), notes, limits
     )
+
+
+def _named_order(path: Path, array: NDArray[Any], axes: str) -> NDArray[Any]:
+    """Bring the axes, which are named by letters, into the order (T, H, W) or (T, H, W, 3)."""
+    names = axes.lower()
+    require(
+        sorted(names) in (sorted("thw"), sorted("thwc")), f"--axes: expected thw, hwt, thwc or tchw, found {axes!r}"
+    )
+    require(
+        len(names) == array.ndim, f"--axes: expected {array.ndim} letters for the shape {array.shape}, found {axes!r}"
+    )
+    ordered = np.transpose(array, [names.index(name) for name in "thwc" if name in names])
+    return ordered[..., 0] if ordered.ndim == 4 and ordered.shape[3] == 1 else ordered
 
 
 def _frames_first(path: Path, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
@@ -162,18 +178,26 @@ def _frames_first(path: Path, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
 
 
 def _frames_last(array: NDArray[Any]) -> bool:
-    """Whether what is still in an array lies along its first two axes, and its last is the slowest to change."""
+    """Whether the planes of the last axis resemble each other more than those of the first, whatever their light."""
     places = [np.unique(np.linspace(0, length - 1, _SAMPLES).astype(int)) for length in array.shape]
     # Whole planes of the last axis would read the whole file.
-    spread = np.asarray(array[places[0]][:, places[1]][:, :, places[2]])
-    middle = np.asarray(array[tuple(slice(max(0, n // 2 - 16), n // 2 + 16) for n in array.shape)], np.float64)
-    if not np.isfinite(spread).all() or not np.isfinite(middle).all():
+    block = np.asarray(array[places[0]][:, places[1]][:, :, places[2]], np.float64)
+    if not np.isfinite(block).all():
         return False
-    spread, middle = (_without_blank_planes(block) for block in (spread, middle))
-    still = [float(spread.mean(axis=axis).std()) for axis in (0, 2)]
-    changes = [float(np.abs(np.diff(middle, axis=axis)).mean()) for axis in (0, 2)]
-    smoother = changes[1] < changes[0] or (still[1] > _FAR_STILLER * still[0] and array.shape[2] < min(array.shape[:2]))
-    return still[1] > _STILLER * still[0] and smoother
+    block = _without_blank_planes(block)
+    # Light that changes makes rows of all frames alike; planes along either axis are brought to the same level.
+    for axis in (0, 2, 0, 2):
+        level = np.abs(block.mean(axis=tuple(other for other in range(3) if other != axis), keepdims=True))
+        block = block / np.maximum(level, np.finfo(float).tiny)
+    return _likeness(block, 2) > _MORE_ALIKE * _likeness(block, 0)
+
+
+def _likeness(block: NDArray[np.float64], axis: int) -> float:
+    """Root of the mean correlation of two planes along an axis."""
+    planes = np.moveaxis(block, axis, 0).reshape(block.shape[axis], -1)
+    planes = planes - planes.mean(axis=1, keepdims=True)
+    norms = np.linalg.norm(planes, axis=1, keepdims=True)
+    return float(np.linalg.norm((planes / np.maximum(norms, np.finfo(float).tiny)).mean(axis=0)))
 
 
 def _without_blank_planes(block: NDArray[np.float64]) -> NDArray[np.float64]:

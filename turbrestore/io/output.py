@@ -10,7 +10,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -98,7 +98,9 @@ def atomic_output(path: str | os.PathLike[str], overwrite: bool = False) -> Iter
     except OSError as error:
         raise StorageError(f"{path}: cannot be written ({error.strerror or error}); nothing was saved") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        # Windows removes no file that a library has left open after an error, which is the one to be told.
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def atomic_write(path: str | os.PathLike[str], data: bytes | memoryview, overwrite: bool = False) -> None:

@@ -96,6 +96,14 @@ def at_levels(pixels: PixelArray, levels: tuple[float, float] | None) -> PixelAr
     return levels[0] + pixels * np.float32(levels[1] - levels[0])
 
 
+def at_full_range(pixels: PixelArray, white: int) -> PixelArray:
+    """Spread unsigned integers, of which none is above ``white``, over the range of their type."""
+    full = np.iinfo(pixels.dtype).max
+    if not 0 < white < full:
+        return pixels
+    return np.rint(np.minimum(pixels, white) * (full / white)).astype(pixels.dtype)
+
+
 def without_alpha(pixels: PixelArray) -> tuple[PixelArray, tuple[str, ...]]:
     """Drop the last channel of two or four; return the pixels, and a warning where there was one."""
     if pixels.ndim == 2 or pixels.shape[2] not in (2, 4):

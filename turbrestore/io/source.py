@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import operator
+import os
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
@@ -296,6 +297,8 @@ class FrameSource:
         >>> FrameSource.from_array(np.full((2, 1, 1), 255, np.uint8)).read().ravel()
         array([1., 1.], dtype=float32)
         """
+        if isinstance(array, str | os.PathLike):
+            raise DataError(f"{name}: expected numbers, found the path {array}; open it with turbrestore.open_frames")
         # What has a type of NumPy is indexed, and converted frame by frame.
         values: Any = array if isinstance(getattr(array, "dtype", None), np.dtype) else np.asanyarray(array)
         dtype = np.dtype(values.dtype)
@@ -377,6 +380,8 @@ def check_cut_short(
     if intact < 1:
         raise DataError(f"{path}: {problem} before the end of the first frame; copy the file again")
     remedy = f"copy the file again or select frames up to {intact}"
+    if problem == "damaged":
+        remedy = f"copy the file again, select frames up to {intact} or allow damaged ones to be skipped"
     raise DataError(f"{path}: {found}; {remedy}")
 
 

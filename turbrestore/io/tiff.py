@@ -42,6 +42,8 @@ _JPEG_END = b"\xff\xd9"
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB = 0, 1, 2
 _NOT_TIFF = "not a TIFF file, or damaged"
 _MOST_SAMPLES = 16
+# Orientations that :func:`upright` changes, and the first of those in which width and height are exchanged.
+_ORIENTATIONS, _FIRST_ON_SIDE = range(2, 9), 5
 # The description of an OME file may name other files, which are not opened.
 _ALONE: dict[str, Any] = {"_multifile": False}
 
@@ -69,15 +71,23 @@ def open_tiff(path: Path, limits: Limits = DEFAULT_LIMITS) -> FrameSource:
             )
             raise DataError(f"{path}: expected grey or RGB pages, found {kind}; convert the file")
         dtype, bits, notes = np.dtype(page.dtype), page.bitspersample, _notes(page)
+        orientation = page.tags.valueof(ORIENTATION_TAG)
+        height, width = page.imagelength, page.imagewidth
+        if orientation in _ORIENTATIONS:
+            notes += ("turned upright as its orientation tag demands",)
+            height, width = (width, height) if orientation >= _FIRST_ON_SIDE else (height, width)
         if count > len(whole):
             reduced = count - len(whole)
             notes += (f"{counted(reduced, 'page')} of reduced size left out",)
         source = source_of_numbers(
             path,
             f"tiff/{dtype}",
-            (len(planes), page.imagelength, page.imagewidth, *((3,) if len(planes[0]) == 3 else channels)),
+            (len(planes), height, width, *((3,) if len(planes[0]) == 3 else channels)),
             dtype,
-            lambda chosen: _frames(path, [(number, planes[number]) for number in chosen], limits),
+            lambda chosen: (
+                upright(pixels, orientation)
+                for pixels in _frames(path, [(number, planes[number]) for number in chosen], limits)
+            ),
             notes,
             limits,
         )

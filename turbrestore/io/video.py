@@ -34,10 +34,11 @@ from .containers.decoding import CONTAINER_SUFFIXES, is_container, open_containe
 from .containers.encoding import BY_SUFFIX, Encoding, Soundtrack, write_container
 from .folders import open_folder
 from .images import ANIMATION_OUTPUT_SUFFIXES, ANIMATION_SUFFIXES, IMAGE_SUFFIXES, open_animation, write_animation
-from .limits import DEFAULT_LIMITS, Limits, check_input
+from .limits import DEFAULT_LIMITS, Limits, check_input, content_suffix, input_errors
 from .npy import open_npy, write_npy
 from .output import check_output
 from .pixels import BAYER_CODES, check_depth, demosaic, to_unit
+from .raw_files import RAW_SUFFIXES
 from .source import FrameRange, FrameSource, Roi, numbers_text, to_slice
 from .tiff import TIFF_SUFFIXES, open_tiff, write_tiff
 
@@ -56,8 +57,11 @@ def open_frames(
     skip_damaged: bool = False,
     bayer: str | None = None,
     hdr: Literal["sdr", "keep"] = "sdr",
+    axes: str | None = None,
 ) -> FrameSource:
     """Open a video: read its headers, check that it is whole, and decode its first frame.
+
+    The content of a file tells its format; its suffix does where the content does not.
 
     Parameters
     ----------
@@ -72,12 +76,14 @@ def open_frames(
     limits : Limits
         Largest video that is read.
     skip_damaged : bool
-        Read a file that is cut short up to the cut, and leave out frames whose checksum fails and on which no others
-        depend, each with a warning, instead of raising DataError.
+        Read a file that is cut short up to the cut, and leave out frames that are damaged, up to the next key frame
+        where others depend on them, with a warning, instead of raising DataError.
     bayer : {"rggb", "grbg", "gbrg", "bggr"}, optional
         Take grey frames for mosaics of a Bayer sensor whose first pixels have these colours.
     hdr : {"sdr", "keep"}
         Turn HDR video (HLG, PQ) into the SDR picture, or keep its codes.
+    axes : str, optional
+        Order of the axes of a .npy array, such as ``thw``, ``hwt``, ``thwc`` or ``tchw``. By default the array tells.
 
     Returns
     -------
@@ -92,7 +98,7 @@ def open_frames(
     DataError
         Not a video, damaged, cut short, empty, too large, or values outside [0, 1].
     ConfigurationError
-        Range or rectangle outside the video, or FITS where Astropy is not installed.
+        Range or rectangle outside the video, axes that do not fit, or FITS where Astropy is not installed.
     StorageError
         The file cannot be read.
 
@@ -106,10 +112,10 @@ def open_frames(
     ((6, 2, 3), 6)
     """
     require(hdr in ("sdr", "keep"), f"hdr: expected sdr or keep, found {hdr!r}")
-    source = _open(Path(path), frames, limits, skip_damaged, hdr == "keep")
+    source = _open(Path(path), frames, limits, skip_damaged, hdr == "keep", axes)
     source = source if bayer is None else _as_bayer(source, bayer)
     source = source.select(frames, roi)
-    source = source.without(source.damaged, Doubt(f"checksum fails: {numbers_text(source.damaged)} left out"))
+    source = source.without(source.damaged, Doubt(f"damaged: {numbers_text(source.damaged)} left out"))
     # Only the reader of a container sets a colour.  It has decoded the first frame of the file, and no frame of a video
     # is beyond full scale.
     if source.colour is None:
@@ -190,15 +196,18 @@ def _soundtrack(companion: FrameSource | None) -> Soundtrack | None:
     """Audio and times of a video file; None for other sources."""
     if companion is None or companion.path is None or companion.timestamps is None:
         return None
-    known = companion.path.is_file() and companion.path.suffix.lower() in CONTAINER_SUFFIXES
+    known = companion.path.is_file() and _suffix_of(companion.path) in CONTAINER_SUFFIXES
     return Soundtrack(companion.path, companion.timestamps) if known else None
 
 
-def _open(path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: bool, keep_hdr: bool) -> FrameSource:
+def _open(
+    path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: bool, keep_hdr: bool, axes: str | None
+) -> FrameSource:
     """Open a whole video by the reader of its format."""
     stop = to_slice(frames).stop
     is_folder = stat.S_ISDIR(check_input(path).st_mode)
-    suffix = path.suffix.lower()
+    suffix = "" if is_folder else _suffix_of(path)
+    require(axes is None or suffix == ".npy", "--axes: has an effect on .npy arrays alone; leave it out")
     if is_folder:
         source = open_folder(path, limits)
     elif suffix == ".ser":
@@ -206,8 +215,8 @@ def _open(path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: b
     elif suffix in TIFF_SUFFIXES:
         source = open_tiff(path, limits)
     elif suffix == ".npy":
-        source = open_npy(path, limits)
-    elif is_fits(path):
+        source = open_npy(path, limits, axes)
+    elif suffix == ".fits" or is_fits(path):
         source = open_fits(path, limits)
     elif suffix in ANIMATION_SUFFIXES:
         source = open_animation(path, stop, limits, skip_damaged)
@@ -219,6 +228,15 @@ def _open(path: Path, frames: FrameRange | None, limits: Limits, skip_damaged: b
         names, found = ", ".join(VIDEO_SUFFIXES), suffix or "no suffix"
         raise DataError(f"{path}: expected a folder of images or one of {names}, found {found}")
     return source
+
+
+def _suffix_of(path: Path) -> str:
+    """Suffix of the format of a file, which its content tells; raw files look like TIFF and others."""
+    suffix = path.suffix.lower()
+    if suffix in RAW_SUFFIXES:
+        return suffix
+    with input_errors(path), path.open("rb") as file:
+        return content_suffix(file.read(64)) or suffix
 
 
 def _as_bayer(source: FrameSource, pattern: str) -> FrameSource:

@@ -43,7 +43,33 @@ def recentring_flow(mean_flow: ArrayLike) -> FloatArray:
 
 
 def recentre(image: ArrayLike, mean_flow: ArrayLike) -> FloatArray:
-    """Move an image (H, W[, 3]) onto the mean geometry of its frames: ``q ∘ (id + W̄)^{-1}``."""
+    """Move an image onto the mean geometry of its frames: ``q ∘ (id + W̄)^{-1}`` (Micheli et al., eq. 12).
+
+    :meth:`turbrestore.Filtered.recentred` does the same with the filtered image and its variance.
+
+    Parameters
+    ----------
+    image : array_like, shape (H, W) or (H, W, 3)
+        q, such as the centroid.
+    mean_flow : array_like, shape (H, W, 2)
+        W̄, pixels, such as ``Filtered.mean_flow``.
+
+    Returns
+    -------
+    ndarray, float32, of the shape of the image
+
+    Raises
+    ------
+    DataError
+        Wrong shapes, or values that are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> ramp = np.tile(np.linspace(0, 1, 11, dtype=np.float32), (8, 1))
+    >>> float(recentre(ramp, np.full((8, 11, 2), [1.0, 0.0]))[4, 5])
+    0.4000000059604645
+    """
     V = recentring_flow(mean_flow)
     # Interpolation by no shift would change the last bits.
     return warp(image, V) if V.any() else check_image(image)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from ..core.errors import OutputError
 
@@ -34,13 +36,22 @@ def lock_folder(folder: str | os.PathLike[str]) -> Iterator[bool]:
     try:
         yield locks
     finally:
-        # Windows removes no file that is open, others must not see it free before it is gone.
-        with suppress(OSError):
-            (place / LOCK).unlink()
+        # Others must not see it free before it is gone.
+        removed = _remove(place / LOCK)
         os.close(descriptor)
+        if not removed:
+            # Windows removes no file that is open, neither this one before nor that of another run now.
+            _remove(place / LOCK)
         if is_new:
             with suppress(OSError):
                 place.rmdir()
+
+
+def _remove(path: Path) -> bool:
+    with suppress(OSError):
+        path.unlink()
+        return True
+    return False
 
 
 def _acquire(path: Path) -> tuple[int, bool]:
@@ -66,27 +77,31 @@ def _is_at(descriptor: int, path: Path) -> bool:
         return False
 
 
-if sys.platform == "win32":
-    import msvcrt
+def _lock(descriptor: int) -> bool:
+    """Lock a file, or raise BlockingIOError; whether the system and the file system lock at all."""
+    try:
+        import fcntl
+    except ImportError:
+        return _lock_on_windows(descriptor)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise
+    except OSError as error:
+        if error.errno in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
+            return False
+        raise
+    return True
 
-    def _lock(descriptor: int) -> bool:
-        try:
-            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-        except PermissionError as error:
-            raise BlockingIOError from error
-        return True
 
-else:
-    import errno
-    import fcntl
-
-    def _lock(descriptor: int) -> bool:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise
-        except OSError as error:
-            if error.errno in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
-                return False
-            raise
-        return True
+def _lock_on_windows(descriptor: int) -> bool:
+    try:
+        # Type checkers know it on Windows alone.
+        msvcrt: Any = import_module("msvcrt")
+    except ImportError:
+        return False
+    try:
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+    except PermissionError as error:
+        raise BlockingIOError from error
+    return True

@@ -28,6 +28,7 @@ from ..pixels import BAYER_REMARK, PixelArray, looks_like_bayer, upright
 from ..source import FrameRange, FrameSource, check_cut_short, to_slice
 from .integrity import ends_early, ffv1_slices_intact, is_cut_short, varies_in_time
 from .pixel_formats import PixelFormat, frame_pixels, has_grey_palette, layout_of
+from .surviving import decoded, surviving
 from .transfer_curves import BT709, remark_on_curve
 
 if TYPE_CHECKING:
@@ -37,13 +38,16 @@ if TYPE_CHECKING:
 CONTAINER_SUFFIXES = (
     *(".mkv", ".mp4", ".m4v", ".mov", ".webm", ".avi", ".gif", ".mts", ".m2ts", ".ts", ".wmv", ".asf", ".3gp", ".3g2"),
     *(".y4m", ".mpg", ".mpeg", ".m2v", ".vob", ".flv", ".f4v", ".ogv", ".dv", ".mxf", ".ivf", ".nut"),
+    *(".h264", ".264", ".avc", ".h265", ".265", ".hevc"),
 )
 # Without this list FFmpeg would also open playlists, which refer to other files.
 OPEN_OPTIONS = {
-    "format_whitelist": "matroska,webm,mov,mp4,avi,gif,mpegts,asf,mpeg,mpegvideo,flv,ogg,yuv4mpegpipe,dv,mxf,ivf,nut"
+    "format_whitelist": "matroska,webm,mov,mp4,avi,gif,mpegts,asf,mpeg,mpegvideo,flv,ogg,yuv4mpegpipe,dv,mxf,ivf,nut,"
+    "h264,hevc"
 }
 # Formats with an index, which leads to a frame exactly.
 _INDEXED = {"matroska,webm", "mov,mp4,m4a,3gp,3g2,mj2"}
+_REMEDY = "copy the file again, select other frames or allow damaged ones to be skipped"
 # Codecs whose packets are decoded independently of each other.
 _INTRA_CODECS = {"ffv1", "mjpeg", "rawvideo", "png", "huffyuv", "ffvhuff", "utvideo", "prores", "dnxhd"}
 
@@ -62,6 +66,8 @@ class _Scan:
     starts_whole: bool
     stamps: NDArray[np.int64]  # (count,): ascending time stamps, ticks
     entries: tuple[int, ...]  # those of the keyframes; none where they do not lead to a frame
+    goes_on: bool = False  # whether a whole keyframe follows the first packet that is lost
+    tolerant: bool = False  # whether packets that cannot be decoded are passed over
 
     def entry(self, number: int) -> int | None:
         """Time stamp of the keyframe to begin with for a frame; None for the first."""
@@ -96,16 +102,19 @@ def open_container(
             if codec == "rawvideo" and not layout.channels and looks_like_bayer(frame_pixels(frame, layout)):
                 notes += (BAYER_REMARK,)
         scan = _scan(path, cut, limits)
-        if not scan.starts_whole:
+        # A filter for fields looks at the frames before and after.
+        intra = codec in _INTRA_CODECS and scan.keyframes == scan.count and not interlaced
+        if skip_damaged and not intra and not cut:
+            scan = _survivors(path, scan, limits)
+        elif not scan.starts_whole:
             # A recording of a transport stream can start anywhere; frames before the first whole one are not decoded.
             scan, missing = _decoded_scan(path, scan, limits)
             text = f"starts in the middle of a group of frames: its first {missing} cannot be decoded"
             notes += (text,) if missing else ()
     cut = cut or scan.intact < scan.count or (duration is not None and ends_early(scan.times, scan.last, duration))
-    # A filter for fields looks at the frames before and after.
-    intra = codec in _INTRA_CODECS and scan.keyframes == scan.count and not interlaced
-    notes += check_cut_short(path, scan.intact, to_slice(frames).stop, skip_damaged) if cut else ()
-    damaged = _check_damage(path, scan, frames, intra, skip_damaged)
+    problem = "damaged" if scan.goes_on else "cut short"
+    notes += check_cut_short(path, scan.intact, to_slice(frames).stop, skip_damaged, problem) if cut else ()
+    damaged = scan.damaged if scan.tolerant else _check_damage(path, scan, frames, intra, skip_damaged)
     varies = scan.times is not None and varies_in_time(scan.times, scan.tick)
     fps = float(rate) if rate else None
     if varies and scan.times is not None:
@@ -180,7 +189,7 @@ def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
     entries: list[int | None] = []
     damaged: list[int] = []
     unchecked: list[int] = []
-    last, intact, starts_whole = 0.0, None, True
+    last, intact, starts_whole, goes_on = 0.0, None, True, False
     with _open(path) as container:
         stream = _video_stream(path, container, limits)
         codec = stream.codec_context.name
@@ -192,6 +201,8 @@ def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
                 continue
             if packet.is_corrupt and intact is None:
                 intact = len(stamps)
+            # The gap may have been noticed in the packet before.
+            goes_on = goes_on or (packet.is_keyframe and intact is not None and len(stamps) > intact + 1)
             if codec == "ffv1":
                 verdict = ffv1_slices_intact(bytes(packet))
                 (unchecked if verdict is None else damaged if not verdict else []).append(len(stamps))
@@ -220,7 +231,28 @@ def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
     known = [entry for entry in entries if entry is not None]
     leads = indexed and len(known) == len(entries) and len(ticks) == len(stamps) and np.diff(ticks).all()
     leading = tuple(sorted(known)) if leads else ()
-    return _Scan(count, intact, len(entries), tuple(damaged), times, tick, last, starts_whole, ticks, leading)
+    return _Scan(count, intact, len(entries), tuple(damaged), times, tick, last, starts_whole, ticks, leading, goes_on)
+
+
+def _survivors(path: Path, scan: _Scan, limits: Limits) -> _Scan:
+    """Count frames as a decoder gives them that passes over damage; without damage the scan stays as it is."""
+    with _open(path) as container:
+        times, damaged = surviving(container, _video_stream(path, container, limits))
+    if len(damaged) == len(times):
+        raise DataError(f"{path}: expected at least one whole frame, found none")
+    if len(times) == scan.count and not damaged:
+        return scan
+    known = np.isfinite(times)
+    filled = np.interp(np.arange(len(times)), np.flatnonzero(known), times[known]) if known.any() else None
+    return replace(
+        scan,
+        count=len(times),
+        intact=len(times),
+        damaged=damaged,
+        times=None if filled is None else filled - filled[0],
+        entries=(),
+        tolerant=True,
+    )
 
 
 def _decoded_scan(path: Path, scan: _Scan, limits: Limits) -> tuple[_Scan, int]:
@@ -278,10 +310,11 @@ def _frames(
                 # Frames outside the range or between the steps are not decoded.
                 numbers = iter(chosen)
                 packets = (packet for index, packet in enumerate(packets) if packet.size == 0 or index in wanted)
-            frames: Iterator[av.VideoFrame] = (frame for packet in packets for frame in packet.decode())
+            frames = decoded(packets, scan.tolerant)
             if interlaced:
-                checked = (_check(path, frame, layout, index) for index, frame in enumerate(frames))
-                frames = _deinterlaced(stream, checked)
+                if not scan.tolerant:
+                    frames = (_check(path, frame, layout, index) for index, frame in enumerate(frames))
+                frames = _deinterlaced(stream, frames)
             elif not intra and (entry := scan.entry(chosen[0])) is not None:
                 container.seek(entry, stream=stream)
                 if (first := _frame_at(int(scan.stamps[chosen[0]]), frames)) is None:
@@ -296,7 +329,9 @@ def _frames(
                 if number >= chosen[-1]:
                     return
     except av.error.FFmpegError as error:
-        raise DataError(f"{path}: frame {number + 1} or after cannot be decoded ({error.strerror})") from error
+        raise DataError(
+            f"{path}: frame {number + 1} or after cannot be decoded ({error.strerror}); {_REMEDY}"
+        ) from error
 
 
 def _frame_at(stamp: int, frames: Iterator[av.VideoFrame]) -> av.VideoFrame | None:
@@ -312,7 +347,7 @@ def _frame_at(stamp: int, frames: Iterator[av.VideoFrame]) -> av.VideoFrame | No
 
 def _check(path: Path, frame: av.VideoFrame, layout: PixelFormat, number: int) -> av.VideoFrame:
     if frame.is_corrupt:
-        raise DataError(f"{path}: frame {number} is damaged; copy the file again or select other frames")
+        raise DataError(f"{path}: frame {number} is damaged; {_REMEDY}")
     if frame.format.name != layout.name or layout.ramp > has_grey_palette(frame):
         raise DataError(f"{path}: frame {number}: expected pixel format {layout.name}, found {frame.format.name}")
     return frame

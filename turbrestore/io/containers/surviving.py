@@ -1,0 +1,71 @@
+"""Frames that survive damage within a stream: from the next key frame on nothing depends on what was lost.
+
+Networks and disks lose packets in the middle of recordings.  The demultiplexer marks a packet as corrupt where it finds
+a gap, and the decoder fails or marks its frame; what either conceals is not found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import av
+
+
+def decoded(packets: Iterable[av.Packet], tolerant: bool) -> Iterator[av.VideoFrame]:
+    """Decode packets one after the other; ``tolerant`` passes over those that cannot be decoded."""
+    import av
+
+    for packet in packets:
+        try:
+            frames: Any = packet.decode()
+        except av.error.FFmpegError:
+            if not tolerant:
+                raise
+            continue
+        yield from frames
+
+
+def surviving(
+    container: av.container.InputContainer, stream: av.VideoStream
+) -> tuple[NDArray[np.float64], tuple[int, ...]]:
+    """Decode a whole stream; return the times of its frames in seconds, and the numbers of those that are damaged.
+
+    A gap is noticed in the packet before it, so the packet after it is taken for damaged too.
+    """
+    import av
+    from av.codec.context import Flags
+
+    # A frame then names the packet that it comes from; decoding reorders them.
+    stream.codec_context.flags |= Flags.copy_opaque
+    times: list[float] = []
+    origins: list[int] = []
+    keys: list[int] = []
+    lost: set[int] = set()
+    count = 0
+    for packet in container.demux(stream):
+        if packet.size > 0:
+            packet.opaque = count
+            lost.update((count, count + 1) if packet.is_corrupt else ())
+            keys += [count] if packet.is_keyframe else []
+            count += 1
+        elif packet.dts is not None:
+            continue
+        try:
+            frames: Any = packet.decode()
+        except av.error.FFmpegError:
+            lost.add(count - 1)
+            continue
+        for frame in frames:
+            times.append(np.nan if frame.time is None else frame.time)
+            origins.append(frame.opaque)
+            lost.update([frame.opaque] if frame.is_corrupt else ())
+    dependent = np.zeros(count + 1, bool)
+    for number in lost:
+        # An intact key frame ends what a loss has spoiled.
+        dependent[number : next((key for key in keys if key > number and key not in lost), count)] = True
+    return np.array(times), tuple(np.flatnonzero(dependent[origins]).tolist())
