@@ -44,7 +44,7 @@ from .results import Restoration, Store
 from .runtime.allocator import returning_freed_memory
 from .runtime.device import explain_device
 from .runtime.runtime import DEFAULT, Runtime
-from .runtime.scratch import iter_frames, mean_of, variance_of
+from .runtime.scratch import iter_frames, mean_of
 from .runtime.steps import Progress, finish
 from .seeing.displacement import LEAST_FRAMES
 from .seeing.strength import Seeing, seeing_of_picture
@@ -53,8 +53,10 @@ from .stacking.fine_grid import fine_image, fine_shape
 from .stacking.placement import settings_of_known_flows
 from .uncertainty.pixel_deviation import measure_deviation
 from .wording import (
+    FEW_FRAMES,
     explain_border,
     explain_dynamics,
+    explain_few_frames,
     explain_filter,
     explain_registration,
     explain_seeing,
@@ -167,6 +169,7 @@ class _Evidence:
 
     saturation: float  # intensity from which the mean is saturated
     is_mean: bool = False  # whether the mean replaces the filtered image, which has structure that the frames lack
+    finds_blur: bool = True  # whether a blur is looked for
     witnesses: BlurWitnesses | None = None  # None if no blur is to be estimated
     halves: HalvedClip | None = None  # None then
 
@@ -234,9 +237,12 @@ def _check_by_frames(
     # No guard overrides a width that was asked for.
     if not run.params.finds_blur:
         return fused, _Evidence(saturation)
+    if structure.changes or len(training) < FEW_FRAMES:
+        run.decide(*explain_few_frames(len(training)))
+        return fused, _Evidence(saturation, finds_blur=False)
     witnesses, halves = _find_witnesses(run, training, fused, halves.alternate.mean), halves.recentred(mean_flow)
     witnesses = replace(witnesses, noise=_fused_noise(fused, halves))
-    return fused, _Evidence(saturation, False, witnesses, halves)
+    return fused, _Evidence(saturation, witnesses=witnesses, halves=halves)
 
 
 def _fused_noise(fused: Restoration, halves: HalvedClip) -> NoiseSpectrum:
@@ -253,7 +259,7 @@ def _deblur_and_crop(run: Run, fused: Restoration, evidence: _Evidence, psf: NDA
     """Deblur the fused image, keep what the halves of the clip agree on, measure its uncertainty, and crop both."""
     params, image, halves = run.params, fused.image, evidence.halves
     deblurred, agreed = None, None
-    if params.runs("deconvolve") and not evidence.is_mean:
+    if params.runs("deconvolve") and evidence.finds_blur and not evidence.is_mean:
         photons = None if halves is None else _photon_noise(run, halves.alternate)
         deblurred = run.stage("deconvolve", "deblurred", lambda: _remove_blur(run, fused, evidence, psf, photons))
         run.decide(*deblurred.decisions)
@@ -339,8 +345,7 @@ def _find_witnesses(run: Run, training: FloatArray, fused: Restoration, mean: Fl
             # Where no displacement can be measured, that of the flow is taken instead, less what the camera adds.
             variances = [np.square(flow - np.median(flow, axis=(0, 1))).mean() for flow in iter_frames(flows)]
             displacement, frames = float(np.mean(variances)), float(len(training))
-        error = float(np.sqrt(variance_of(flows).mean() / len(training)))
-        known = BlurWitnesses(displacement, frames, picture, position_error=error)
+        known = BlurWitnesses(displacement, frames, picture)
         return measure_witnesses(cropped, flows, mean[rows, columns], _of_optics(known, run, seeing))
 
 

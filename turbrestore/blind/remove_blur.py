@@ -273,13 +273,11 @@ def find_blur(
     grey = luminance(image)
     if witnesses.picture is not None:
         grey = np.ascontiguousarray(grey[witnesses.picture])
-    evidence = image_evidence(grey, runtime, witnesses.noise)
+    evidence = image_evidence(grey, runtime)
     ratio = None if witnesses.variation is None else witnesses.variation.with_power(grey)
     posterior = blur_posterior(evidence, witnesses, ratio)
     widest = min(WIDEST, min(grey.shape) / SIGMAS_A_SIDE)
-    # What the mean geometry of few frames is off by blurs the expected image as a lens would, and stays.
-    sure = max(posterior.removed**2 - witnesses.position_error**2, 0.0) ** 0.5
-    posterior = replace(posterior, removed=min(sure, widest))
+    posterior = replace(posterior, removed=min(posterior.removed, widest))
     if evidence is None:
         return estimate_blur(image, exponent=params.exponent, runtime=runtime), replace(posterior, removed=0.0)
     if posterior.removed == 0:

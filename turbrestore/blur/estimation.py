@@ -31,26 +31,25 @@ A fused image is never sharper than its pixels and the interpolation of the regi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_grey
 from ..core.errors import require
 from ..core.noise import estimate_noise
-from ..core.noise_spectrum import SIDE, NoiseSpectrum
 from ..display.curves import plot_blur
 from ..display.preview import preview
 from ..runtime.fourier import fast_length
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import ThreadTeam, one_thread_each
 from .edges import edge_limit
-from .marginal_likelihood import WIDTHS, ImageGradients, image_gradients, likeliest_width, width_costs
+from .marginal_likelihood import WIDTHS, image_gradients, likeliest_width, width_costs
 from .psf import GAUSSIAN, Float64Array, check_exponent, fused_exponent
 
 if TYPE_CHECKING:
@@ -161,7 +160,7 @@ class BlurCandidate:
     """Blur found at one reduction of an image."""
 
     estimate: BlurEstimate  # its uncertainty is infinite until :func:`choose_blur` has computed it
-    gradients: ImageGradients  # of the part of the reduced image that was analysed
+    part: FloatArray  # (h, w): the part of the reduced image that was analysed
     asked: float | None = None  # exponent that was asked for; None for that of fused frames
 
     @property
@@ -238,15 +237,9 @@ def removable_width(sigma: ArrayLike, uncertainty: ArrayLike) -> Float64Array:
 
 
 def find_candidates(
-    image: ArrayLike,
-    noise: float | None = None,
-    exponent: float | None = None,
-    spectrum: NoiseSpectrum | None = None,
+    image: ArrayLike, noise: float | None = None, exponent: float | None = None
 ) -> tuple[BlurCandidate, ...]:
-    """Find the likeliest blur at each reduction of an image, without its uncertainty.
-
-    ``noise`` is the standard deviation of its noise, or ``spectrum`` the power of it at every frequency.
-    """
+    """Find the likeliest blur at each reduction of an image, without its uncertainty."""
     grey = check_grey(image)
     usable = noise is None or (np.isfinite(noise) and noise >= 0)
     require(usable, f"noise: expected a finite number of 0 or more, found {noise}")
@@ -255,12 +248,8 @@ def find_candidates(
     if min(grey.shape) < _SMALLEST_IMAGE or np.ptp(grey) <= LEAST_NOISE:
         return ()
     factors = [factor for factor in _REDUCTIONS if factor == 1 or min(grey.shape) >= factor * _SMALLEST_SIDE]
-    if spectrum is not None:
-        return tuple(_find_candidate(grey, factor, exponent, spectrum) for factor in factors)
-    if noise is not None:
-        return tuple(_find_candidate(grey, factor, exponent, noise / factor) for factor in factors)
-    multiple = noise_multiple(grey)
-    return tuple(_find_candidate(grey, factor, exponent, None, multiple) for factor in factors)
+    multiple = 1.0 if noise is not None else noise_multiple(grey)
+    return tuple(_find_candidate(grey, factor, exponent, noise, multiple) for factor in factors)
 
 
 def choose_blur(candidates: tuple[BlurCandidate, ...], runtime: Runtime = DEFAULT) -> BlurEstimate:
@@ -287,47 +276,22 @@ def _preference(estimate: BlurEstimate) -> float:
 
 
 def _find_candidate(
-    grey: FloatArray,
-    factor: int,
-    exponent: float | None,
-    noise: float | NoiseSpectrum | None,
-    multiple: float = _MULTIPLES[0],
+    grey: FloatArray, factor: int, exponent: float | None, noise: float | None, multiple: float
 ) -> BlurCandidate:
-    reduced, response = _reduce(grey, factor), None
+    reduced = _reduce(grey, factor)
     # A copy, so that the reduced image is freed.
     part = _most_detailed(reduced).copy()
-    if isinstance(noise, NoiseSpectrum):
-        level, response = _whitened(reduced, noise, factor)
-    else:
-        level = assumed_noise(reduced, noise, multiple)
-    gradients = image_gradients(part, response)
-    costs = width_costs(gradients, _exponents(exponent, factor), level, rises=2)
+    level = assumed_noise(reduced, multiple=multiple) if noise is None else assumed_noise(reduced, noise / factor)
+    costs = width_costs(image_gradients(part), _exponents(exponent, factor), level, rises=2)
     evidence, width = float(costs[0] - costs.min()), unreduced_width(likeliest_width(costs), factor)
     widths = factor * WIDTHS[: len(costs)]
     shape = fused_exponent(width) if exponent is None else exponent
     estimate = BlurEstimate(width, float("inf"), shape, level, factor, evidence, widths, costs)
-    return BlurCandidate(estimate, gradients, exponent)
-
-
-def _whitened(
-    reduced: FloatArray, noise: NoiseSpectrum, factor: int
-) -> tuple[float, Callable[[NDArray[np.floating]], Float64Array]]:
-    """N of a reduced image, and the response that makes noise and misfit together white.
-
-    Means of r×r pixels keep the power of the noise at a frequency for each area, and a reduced pixel has r² of it.
-    """
-    misfit = max(_MISFIT * float(reduced.std()), LEAST_NOISE)
-
-    def power(frequency: NDArray[np.floating]) -> Float64Array:
-        return np.square(_MULTIPLES[0] / factor) * noise.at(frequency / factor) + misfit**2
-
-    nu = np.fft.fftfreq(SIDE)
-    level = float(np.sqrt(power(np.hypot(nu[:, None], nu)).mean()))
-    return level, lambda frequency: level / np.sqrt(power(frequency))
+    return BlurCandidate(estimate, part, exponent)
 
 
 def _with_uncertainty(candidate: BlurCandidate, team: ThreadTeam) -> BlurEstimate:
-    found, gradients = candidate.estimate, candidate.gradients
+    found, gradients = candidate.estimate, image_gradients(candidate.part)
     levels = found.noise / 2, 2 * found.noise
     shapes = _exponents(candidate.asked, found.reduction)
     both = team.map(partial(width_costs, gradients, shapes, rises=1), levels)

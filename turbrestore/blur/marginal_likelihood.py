@@ -13,7 +13,6 @@ x : gradients of the scene, ``y = k ∗ x + noise``
 k : point spread function of :func:`turbrestore.blur.psf.blur_otf`; σ its width, ‖k‖² its energy
 n : standard deviation of the noise of the image
 λ : variance of the noise of y, 2 n²
-W : response that makes the noise of the image white, where it is not; y and k are taken behind it
 C_i : posterior variance of x_i
 
 The cost is the variational upper bound of the negative logarithm of the marginal likelihood (Wipf and Zhang,
@@ -30,12 +29,11 @@ It is minimised by alternating
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
 from ..runtime.jit import jit
@@ -62,24 +60,15 @@ class ImageGradients:
     planes: FloatArray  # (h, w, 2): differences along x and along y, intensity per pixel
     spectrum: FloatArray  # (h, w, 2): Fourier transform of ``planes`` read as complex numbers
     frequency: FloatArray  # (h, w): spatial frequency of each entry of ``spectrum``, cycles per pixel
-    response: FloatArray | None = None  # (h, w): W, None where it is 1
 
 
-def image_gradients(
-    image: FloatArray, response: Callable[[FloatArray], NDArray[np.floating]] | None = None
-) -> ImageGradients:
-    """Compute the tapered gradients of an image (h + 1, w + 1) and their spectrum; ``response`` is W of frequencies."""
+def image_gradients(image: FloatArray) -> ImageGradients:
+    """Compute the tapered gradients of an image (h + 1, w + 1) and their spectrum."""
     dx, dy = image[:-1, 1:] - image[:-1, :-1], image[1:, :-1] - image[:-1, :-1]
     rows, columns = (_taper(size) for size in dx.shape)
     planes = np.stack([dx, dy], axis=-1) * np.outer(rows, columns)[..., None]
     frequency = np.hypot(np.fft.fftfreq(len(rows))[:, None], np.fft.fftfreq(len(columns)))
-    frequency, spectrum = frequency.astype(np.float32), cv2.dft(planes)
-    if response is None:
-        return ImageGradients(planes, spectrum, frequency)
-    white = response(frequency).astype(np.float32)
-    spectrum *= white[..., None]
-    planes = cv2.dft(spectrum, flags=cv2.DFT_INVERSE | cv2.DFT_SCALE)
-    return ImageGradients(planes, spectrum, frequency, white)
+    return ImageGradients(planes, cv2.dft(planes), frequency.astype(np.float32))
 
 
 def width_costs(gradients: ImageGradients, exponent: float | Sequence[float], noise: float, rises: int) -> Float64Array:
@@ -112,8 +101,6 @@ def fit_scene(
     """Minimise the bound over x and γ, both (h, w, 2), for one blur, from a given start."""
     width, exponent = blur
     otf = np.exp(-np.log(2) * (gradients.frequency / half_frequency(width)) ** exponent).astype(np.float32)
-    if gradients.response is not None:
-        otf = otf * gradients.response
     # ‖k‖² by Parseval.  OpenCV's inverse transform does not divide by the size, so the kernel does.
     energy, variance = np.float32(np.square(otf).mean()), np.float32(2 * noise**2)
     kernel = np.repeat((otf / np.float32(otf.size))[..., None], 2, axis=2)

@@ -96,8 +96,6 @@ class BlurWitnesses:
     diffraction: float | None = None  # λ/D of known optics, pixels
     spread: float | None = None  # standard deviation of ln V, if V is what a measured D/r0 makes
     noise: NoiseSpectrum | None = None  # of the fused image
-    # Standard error of the mean geometry along one axis if every frame were independent, pixels.
-    position_error: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -73,7 +73,7 @@ def fit_noise_spectrum(differences: Iterable[FloatArray], scene: FloatArray) -> 
     found = np.array([_fit_ring(ring, m) for ring, m in zip(usual.T, of_scene.T, strict=True)])
     # The mean of each window is taken out, which leaves half of the lowest ring.
     found[0] = found[1]
-    return NoiseSpectrum(*np.maximum(found.T, [[_LEAST], [0], [0]]))
+    return NoiseSpectrum(*np.maximum(found.T, [[_LEAST], [0.0], [0.0]]))
 
 
 @functools.cache

@@ -19,11 +19,10 @@ from functools import partial
 import numpy as np
 
 from ...core.arrays import FloatArray
-from ...core.noise_spectrum import NoiseSpectrum
 from ...runtime.runtime import DEFAULT, Runtime
 from ...runtime.threads import ThreadTeam, one_thread_each
 from ..estimation import BlurCandidate, BlurEstimate, choose_blur, find_candidates, unreduced_width
-from ..marginal_likelihood import WIDTHS, width_costs
+from ..marginal_likelihood import WIDTHS, image_gradients, width_costs
 from ..psf import Float64Array
 
 # Exponents of the transfer function: strong air, weak air behind an aperture, a lens.
@@ -45,19 +44,17 @@ class ImageEvidence:
     estimate: BlurEstimate
 
 
-def image_evidence(
-    image: FloatArray, runtime: Runtime = DEFAULT, noise: NoiseSpectrum | None = None
-) -> ImageEvidence | None:
+def image_evidence(image: FloatArray, runtime: Runtime = DEFAULT) -> ImageEvidence | None:
     """Compute the costs of an image (H, W); None if it is too small or uniform."""
     with one_thread_each():
-        found = find_candidates(image, spectrum=noise)
+        found = find_candidates(image)
         if not found:
             return None
         estimate = choose_blur(found, runtime)
         chosen = judged_candidate(found, estimate.reduction)
-        costs_of = partial(width_costs, chosen.gradients, noise=chosen.estimate.noise, rises=_RISES)
+        gradients, noise = image_gradients(chosen.part), chosen.estimate.noise
         with ThreadTeam(min(runtime.workers, 2)) as team:
-            curves = list(team.map(costs_of, EXPONENTS))
+            curves = list(team.map(partial(width_costs, gradients, noise=noise, rises=_RISES), EXPONENTS))
     costs = np.full((len(EXPONENTS), len(WIDTHS)), np.inf)
     for row, curve in zip(costs, curves, strict=True):
         row[: len(curve)] = curve

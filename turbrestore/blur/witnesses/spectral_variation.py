@@ -10,7 +10,8 @@ s_4 : ``Var |F|² / (E |F|²)²``, the same of powers, which a shift of a window
 
 The scene cancels in both ratios.  Both are means over a ring of frequencies and over windows that are weighted by their
 power.  The noise of a frame, which the ratios must not contain, is known at every frequency
-(:mod:`turbrestore.registration.registered_noise`).
+(:mod:`turbrestore.registration.registered_noise`).  At the highest frequencies, at which no signal is left, whatever
+varies is noise; what exceeds the known noise there is added to it at all frequencies.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ SIDE, _BORDER = 64, 16
 _WINDOWS, _FRAMES = 5, 48
 # Fewest frames that are compared.
 _FEWEST = 4
-# Frames whose flows tell the stretch.
-_STRETCHES = 4
+# Frames whose flows tell the stretch, and highest rings, at which no signal is left.
+_STRETCHES, _NOISE_RINGS = 4, 4
 # Least power of the noise: a standard deviation of 10⁻⁴ under the window.
 _LEAST_NOISE = 1e-8 * SIDE**2 * 9 / 64
 # Frequencies of the rings, cycles per pixel.
@@ -110,7 +111,8 @@ def measure_variation(
         return None
     # Means of pixels keep the power of the noise for each area, and spectra here are not normalised.
     power = noise.at(RINGS / reduction) / reduction**2 * np.square(_profile()).sum()
-    power = np.maximum(power, _LEAST_NOISE)
+    excess = float(np.median((np.mean(sums, axis=0)[0] - power)[-_NOISE_RINGS:]))
+    power = np.maximum(power + max(excess, 0.0), _LEAST_NOISE)
     return _ratios(np.array(sums), power, len(picked), float(np.mean(stretches)), reduction)
 
 
