@@ -23,9 +23,9 @@ from .seeing.strength import LARGEST_BLUR, Estimate, Seeing
 _COUNTS = 0.2
 # Share of saturated pixels above which they are reported.
 _REPORTED_SHARE = 0.01
-# Fewest frames that are deblurred.  Where the air moves the scene by 1.5 pixels and hardly changes from one frame to the
-# next, the mean of fewer is off by more than a pixel: a photograph behind a blur of 1 pixel loses 0.4 to 1.8 dB when it
-# is deblurred, and gains from five frames on.
+# Fewest frames that are deblurred.  Where the air moves the scene by 1.5 pixels and hardly changes between frames that
+# follow each other, the mean of fewer is off by more than a pixel: a photograph behind a blur of 1 pixel loses 0.4 to
+# 1.8 dB when it is deblurred, and gains from five frames on.
 FEW_FRAMES = 5
 # Motion beyond this share of the shorter side is too large for optical flow in some places.
 _LARGE_MOTION = 1 / 12
