@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).parents[1] / "turbrestore"
 ORDER = [
     "core", "runtime", "display", "io", "registration", "footage", "dynamics", "filtering", "blur_moments", "blur",
     "deconvolution", "blind", "steady", "synthesis", "seeing", "uncertainty", "agreement", "metrics", "wording",
-    "results", "settings", "memory_plan", "runs", "preparation", "stacking", "fusion", "pipeline",
+    "results", "settings", "memory_plan", "runs", "preparation", "stacking", "fusion", "evidence", "pipeline",
     "report",
 ]  # fmt: skip
 HEAVY = {"torch", "kornia", "numba", "matplotlib", "av", "imageio", "tifffile", "skimage", "rich", "PIL", "cyclopts"}

@@ -69,7 +69,7 @@ def test_figures_of_the_filter_are_means_over_tiles():
         image, flow = np.full(tile.shape, 0.5, np.float32), np.full((*tile.shape, 2), 0.25, np.float32)
         one = np.array([value, np.nan])
         share = np.array([0.25, 0.75])
-        return Filtered(image, 2 * image, np.ones((2, 3)), one, one, one, share, value, value, flow)
+        return Filtered(image, 2 * image, np.ones((2, 3)), one, one, one, share, value, value, value, flow)
 
     filtered = join_filtered(map(part, tiles, (1.0, 2.0, 6.0)), tiles, (40, 80))
     weights = [tile.row_weights.sum() * tile.column_weights.sum() for tile in tiles]

@@ -4,27 +4,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .agreement.last_guard import Guarded, keep_agreed
 from .blind.remove_blur import SIGMAS_A_SIDE, Deblurred, remove_blur_steps
-from .blind.structure import compare_structure
 from .blur.measured_psf import psf_from_image
-from .blur.posterior import BlurWitnesses, measure_witnesses
-from .blur.psf import GAUSSIAN
-from .blur.witnesses.short_exposure import displacement_variance
-from .core.arrays import FloatArray, luminance
+from .core.arrays import FloatArray
 from .core.decision import Decision
 from .core.errors import require
-from .core.noise import NoiseCurve, photon_noise
-from .core.noise_spectrum import NoiseSpectrum
-from .deconvolution.conjugate_gradient import wiener_filtered
+from .core.noise import NoiseCurve
 from .deconvolution.problem import read_blur
 from .dynamics.dynamic_texture import identify
+from .evidence import Evidence, agreed_image, evidence_of_frames, measure_photon_noise
 from .footage.checks.content import without_blank
 from .footage.levels import Levels
 from .fusion import Run, TileMap, added_up, centroid_stage, filter_stage, finish_mean, read_training
@@ -36,15 +30,12 @@ from .preparation import prepare, undo_preparation
 from .registration.centroid import Centroid
 from .registration.coverage import Rectangle, coverage, well_seen
 from .registration.flow import MIN_SIDE
-from .registration.flow_algebra import invert_flow
-from .registration.recentring import recentre, recentring_flow
-from .registration.registered_noise import HalvedClip, Halves, halve
-from .registration.warp import warp
+from .registration.recentring import recentre
 from .results import Restoration, Store
 from .runtime.allocator import returning_freed_memory
 from .runtime.device import explain_device
 from .runtime.runtime import DEFAULT, Runtime
-from .runtime.scratch import iter_frames, mean_of
+from .runtime.scratch import mean_of
 from .runtime.steps import Progress, finish
 from .seeing.displacement import LEAST_FRAMES
 from .seeing.strength import Seeing, seeing_of_picture
@@ -53,22 +44,15 @@ from .stacking.fine_grid import fine_image, fine_shape
 from .stacking.placement import settings_of_known_flows
 from .uncertainty.pixel_deviation import measure_deviation
 from .wording import (
-    FEW_FRAMES,
     explain_border,
     explain_dynamics,
-    explain_few_frames,
     explain_filter,
     explain_registration,
     explain_seeing,
-    explain_structure,
 )
 
 # Every border pixel of a cropped image is visible in at least this share of the training frames.
 _SEEN = 0.9
-# Least variance of the noise of dark parts, relative to that of bright ones, that the decision states.
-_LEAST_SHARE = 0.01
-# Least standard deviation of ln V, the displacement that D/r0 implies: theory and simulated clips agree no better.
-_LEAST_SPREAD = 0.2
 
 
 def restore(
@@ -163,18 +147,7 @@ def restore(
     return undo_preparation(restoration, prepared)
 
 
-@dataclass(frozen=True)
-class _Evidence:
-    """What :func:`_deblur_and_crop` needs to know from the training frames, which are freed before it runs."""
-
-    saturation: float  # intensity from which the mean is saturated
-    is_mean: bool = False  # whether the mean replaces the filtered image, which has structure that the frames lack
-    finds_blur: bool = True  # whether a blur is looked for
-    witnesses: BlurWitnesses | None = None  # None if no blur is to be estimated
-    halves: HalvedClip | None = None  # None then
-
-
-def _fuse(run: Run) -> tuple[Restoration, _Evidence]:
+def _fuse(run: Run) -> tuple[Restoration, Evidence]:
     """Fuse the frames into one image; the training frames are freed when this function returns."""
     params, source, runtime = run.params, run.source, run.plan.runtime
     total = np.zeros(source.shape[1:])
@@ -216,56 +189,21 @@ def _fuse(run: Run) -> tuple[Restoration, _Evidence]:
         seeing=seeing,
     )
     if filtered is None:
-        return fused, _Evidence(saturation)
-    return _check_by_frames(run, fused, training, filtered.mean_flow, saturation)
+        return fused, Evidence(saturation)
+    return evidence_of_frames(run, fused, training, filtered.mean_flow, saturation)
 
 
-def _check_by_frames(
-    run: Run, fused: Restoration, training: FloatArray, mean_flow: FloatArray, saturation: float
-) -> tuple[Restoration, _Evidence]:
-    """Check that the frames have the structure of the filtered image, else take the mean; measure how blurred it is."""
-    image, flows = luminance(fused.image), fused.centroid.flows
-    if mean_flow.any():
-        # The flows start from the geometry of the centroid.
-        image = warp(image, invert_flow(recentring_flow(mean_flow)))
-    halves = halve(training, flows, training.shape[1:], len(training), run.plan.runtime.threads)
-    new, lasting = halves.alternate.noise().deviation ** 2, halves.lasting.noise().deviation ** 2
-    structure = compare_structure(image, training, flows, len(training) * new, max(lasting - new, 0.0))
-    run.decide(*explain_structure(structure))
-    if not structure.explained:
-        return replace(fused, image=fused.mean), _Evidence(saturation, is_mean=True)
-    # No guard overrides a width that was asked for.
-    if not run.params.finds_blur:
-        return fused, _Evidence(saturation)
-    if structure.changes or len(training) < FEW_FRAMES:
-        run.decide(*explain_few_frames(len(training)))
-        return fused, _Evidence(saturation, finds_blur=False)
-    witnesses, halves = _find_witnesses(run, training, fused, halves.alternate.mean), halves.recentred(mean_flow)
-    witnesses = replace(witnesses, noise=_fused_noise(fused, halves))
-    return fused, _Evidence(saturation, witnesses=witnesses, halves=halves)
-
-
-def _fused_noise(fused: Restoration, halves: HalvedClip) -> NoiseSpectrum:
-    """Noise of the filtered image: that of the mean of the training frames, for as many frames as its weights leave."""
-    noise, filtered = halves.noise(), fused.filtered
-    if filtered is None:
-        return noise
-    # Σ / Z₀ is one over the number of frames that count.
-    counting = filtered.image_noise / max(float(filtered.variance.mean()), 1e-12)
-    return noise.scaled(halves.count / counting * filtered.noise_gain)
-
-
-def _deblur_and_crop(run: Run, fused: Restoration, evidence: _Evidence, psf: NDArray[np.float64] | None) -> Restoration:
+def _deblur_and_crop(run: Run, fused: Restoration, evidence: Evidence, psf: NDArray[np.float64] | None) -> Restoration:
     """Deblur the fused image, keep what the halves of the clip agree on, measure its uncertainty, and crop both."""
     params, image, halves = run.params, fused.image, evidence.halves
     deblurred, agreed = None, None
     if params.runs("deconvolve") and evidence.finds_blur and not evidence.is_mean:
-        photons = None if halves is None else _photon_noise(run, halves.alternate)
+        photons = None if halves is None else measure_photon_noise(run, halves.alternate)
         deblurred = run.stage("deconvolve", "deblurred", lambda: _remove_blur(run, fused, evidence, psf, photons))
         run.decide(*deblurred.decisions)
         image = deblurred.deconvolution.image
         if halves is not None:
-            agreed = _keep_agreed(run, fused, deblurred, halves)
+            agreed = agreed_image(run, fused, deblurred, halves)
             run.decide(*agreed.decisions)
             image = agreed.image
     seen = coverage(fused.centroid.flows)
@@ -294,22 +232,6 @@ def _deblur_and_crop(run: Run, fused: Restoration, evidence: _Evidence, psf: NDA
     )
 
 
-def _keep_agreed(run: Run, fused: Restoration, deblurred: Deblurred, halves: HalvedClip) -> Guarded:
-    """Compare the halves of the clip behind the deconvolution of the image, and keep what they agree on."""
-    done, posterior = deblurred.deconvolution, deblurred.posterior
-
-    def sharpened(half: FloatArray) -> FloatArray:
-        grey = luminance(half)
-        if done.sigma == 0:
-            return grey
-        return wiener_filtered(grey, done.sigma, GAUSSIAN if posterior is None else posterior.exponent, done.noise)
-
-    pairs = halves.alternate, halves.lasting
-    sharp = [Halves(sharpened(pair.first), sharpened(pair.second)) for pair in pairs]
-    mean = halves.alternate.mean
-    return keep_agreed(done.image, mean, halves.noise(), sharp, run.prepared.levels.full_scale)
-
-
 def _add_finer_grid(run: Run, restoration: Restoration) -> Restoration:
     """Add the image on the finer grid."""
     with run.timed("scale"):
@@ -332,39 +254,8 @@ def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seein
     return seeing
 
 
-def _find_witnesses(run: Run, training: FloatArray, fused: Restoration, mean: FloatArray) -> BlurWitnesses:
-    """Measure what the frames say about their blur; ``mean`` (H, W[, 3]) is that of the registered frames."""
-    seeing = fused.seeing
-    measured = None if seeing is None else seeing.displacement_variance
-    rows, columns = picture = run.prepared.picture
-    with run.timed("witnesses"):
-        cropped, flows = training[:, rows, columns], fused.centroid.flows[:, rows, columns]
-        if seeing is not None and measured is not None:
-            displacement, frames = measured.value, seeing.independent_frames
-        else:
-            # Where no displacement can be measured, that of the flow is taken instead, less what the camera adds.
-            variances = [np.square(flow - np.median(flow, axis=(0, 1))).mean() for flow in iter_frames(flows)]
-            displacement, frames = float(np.mean(variances)), float(len(training))
-        known = BlurWitnesses(displacement, frames, picture)
-        return measure_witnesses(cropped, flows, mean[rows, columns], _of_optics(known, run, seeing))
-
-
-def _of_optics(known: BlurWitnesses, run: Run, seeing: Seeing | None) -> BlurWitnesses:
-    """Add the diffraction of the optics and, if D/r0 is measured, the displacement that it implies."""
-    optics = run.params.optics
-    if optics is None:
-        return known
-    strength, diffraction = None if seeing is None else seeing.d_over_r0, optics.diffraction
-    if optics.distance is None or strength is None or not np.isfinite(strength.high):
-        return replace(known, diffraction=diffraction)
-    implied = float(displacement_variance(np.array(strength.value), np.array(diffraction)))
-    # V grows as the power 5/3 of D/r0, and a 95 % interval has four standard deviations.
-    spread = max(5 / 3 * np.log(strength.high / strength.low) / 4, _LEAST_SPREAD)
-    return replace(known, displacement=implied, diffraction=diffraction, spread=float(spread))
-
-
 def _remove_blur(
-    run: Run, fused: Restoration, evidence: _Evidence, psf: NDArray[np.float64] | None, photons: NoiseCurve | None
+    run: Run, fused: Restoration, evidence: Evidence, psf: NDArray[np.float64] | None, photons: NoiseCurve | None
 ) -> Deblurred:
     """Estimate the blur and remove it, with the centroid as the guide."""
     params, plan, guide = run.params, run.plan, fused.centroid.image
@@ -376,18 +267,8 @@ def _remove_blur(
     return finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
 
 
-def _photon_noise(run: Run, halves: Halves) -> NoiseCurve | None:
-    """Measure how the noise of the image depends on its level."""
-    curve = photon_noise(luminance(halves.first), luminance(halves.second))
-    if curve is not None:
-        times = float(curve.variances[-1] / max(curve.variances[0], _LEAST_SHARE * curve.variances[-1]))
-        reason = f"its variance is {times:.0f} times as large where the scene is bright, as that of photons"
-        run.decide(Decision("noise", "dark parts count more than bright ones in the deconvolution", reason))
-    return curve
-
-
 def _measure_uncertainty(
-    run: Run, image: FloatArray, fused: Restoration, evidence: _Evidence, seen: FloatArray, deblurred: Deblurred | None
+    run: Run, image: FloatArray, fused: Restoration, evidence: Evidence, seen: FloatArray, deblurred: Deblurred | None
 ) -> FloatArray | None:
     """Measure the standard deviation of every pixel of a filtered image."""
     filtered, dynamics = fused.filtered, fused.dynamics

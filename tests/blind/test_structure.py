@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from conftest import make_sequence
-from turbrestore.blind.structure import LEFT, UNSEEN, StructureReading, compare_structure
+from turbrestore.blind.structure import LASTING, LEFT, UNSEEN, StructureReading, compare_structure
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
 from turbrestore.synthesis.scenes import SCENES
@@ -69,14 +69,35 @@ def test_a_shaken_camera_is_explained_by_its_shifts():
     frames = np.stack([large[y : y + 120, x : x + 120] for x, y in shifts])
     flows = np.broadcast_to((20 - shifts)[:, None, None].astype(np.float32), (*frames.shape, 2))
     reading = compare_structure(large[20:140, 20:140], frames, flows)
-    assert reading.unseen < 0.01 and reading.left < 0.01 and reading.passed
-    assert not compare_structure(large[20:140, 20:140], frames, 0 * flows).passed
+    assert reading.unseen < 0.01 and reading.left < 0.01 and reading.explained
+    assert not compare_structure(large[20:140, 20:140], frames, 0 * flows).explained
 
 
 def test_both_bounds_must_be_exceeded():
     at = StructureReading
-    assert at(2 * UNSEEN, LEFT / 2).passed and at(UNSEEN / 2, 1.0).passed and not at(2 * UNSEEN, 1.0).passed
+    assert at(2 * UNSEEN, LEFT / 2).explained and at(UNSEEN / 2, 1.0).explained
+    assert not at(2 * UNSEEN, 1.0).explained
     assert explain_structure(at(2 * UNSEEN, LEFT / 2)) == ()
+
+
+def test_a_scene_that_changes_is_named_and_the_mean_is_the_result_where_registration_explains_little():
+    steady, changing = StructureReading(0.0, 1.0, LASTING / 2), StructureReading(0.0, 1.0, 2 * LASTING)
+    assert steady.explained and not changing.explained
+    (decision,) = explain_structure(changing)
+    assert decision.subject == "structure" and "--frames" in decision.reason
+    (decision,) = explain_structure(StructureReading(0.0, LEFT / 2, 2 * LASTING))
+    assert decision.choice == "no blur is removed"
+
+
+def test_noise_does_not_count_as_what_registration_leaves():
+    rng = np.random.default_rng(2)
+    scene = cv2.GaussianBlur(SCENES["camera"](SIDE, SIDE), (0, 0), 1.0)
+    shifts = rng.integers(-3, 4, (16, 2))
+    clean = np.stack([np.roll(scene, shift, axis=(0, 1)) for shift in shifts])
+    frames = np.float32(clean + rng.normal(0, 0.1, clean.shape))
+    flows = np.broadcast_to(shifts[:, None, None, ::-1].astype(np.float32), (*frames.shape, 2))
+    assert compare_structure(scene, frames, flows).left > LEFT
+    assert compare_structure(scene, frames, flows, noise=0.01).left < LEFT / 3
 
 
 @given(gain=st.floats(0.05, 1), offset=st.floats(-0.2, 0.2))

@@ -101,7 +101,7 @@ def still_clip(scene, count=12, noise=0.004):
 def test_nothing_is_removed_from_a_sharp_clip_that_stands_still():
     frames, flows = still_clip(SCENES["camera"](128, 128))
     image = frames.mean(axis=0)
-    witnesses = measure_witnesses(frames, flows, BlurWitnesses(0.0, 12.0))
+    witnesses = measure_witnesses(frames, flows, image, BlurWitnesses(0.0, 12.0))
     result = finish(remove_blur_steps(image, image, witnesses=witnesses))
     assert result.deconvolution.sigma == 0 and result.posterior.removed == 0
     np.testing.assert_array_equal(result.deconvolution.image, np.clip(image, 0, 1))
@@ -111,7 +111,7 @@ def test_nothing_is_removed_from_a_sharp_clip_that_stands_still():
 def test_a_lens_is_told_from_the_air():
     frames, flows = still_clip(cv2.GaussianBlur(SCENES["camera"](128, 128), (0, 0), 2.0))
     image = frames.mean(axis=0)
-    witnesses = measure_witnesses(frames, flows, BlurWitnesses(0.0, 12.0))
+    witnesses = measure_witnesses(frames, flows, image, BlurWitnesses(0.0, 12.0))
     found = blur_posterior(image_evidence(image), witnesses, witnesses.variation.with_power(image))
     assert found.air < 0.2 and found.width[1] == pytest.approx(2.0, rel=0.25)
     assert 0 < found.removed < 2.2 and found.exponent > 1.8
@@ -121,7 +121,7 @@ def test_a_lens_is_told_from_the_air():
 def test_a_wide_blur_that_stands_still_is_found(sigma):
     frames, flows = still_clip(cv2.GaussianBlur(SCENES["camera"](256, 256), (0, 0), sigma))
     image = frames.mean(axis=0)
-    witnesses = measure_witnesses(frames, flows, BlurWitnesses(0.0, 12.0))
+    witnesses = measure_witnesses(frames, flows, image, BlurWitnesses(0.0, 12.0))
     found = blur_posterior(image_evidence(image), witnesses, witnesses.variation.with_power(image))
     assert found.width[1] == pytest.approx(sigma, rel=0.3) and 0.4 * sigma < found.removed < 1.2 * sigma
 

@@ -252,7 +252,7 @@ def test_a_tile_agrees_with_the_whole_away_from_its_border():
 def with_whole_image_settings(image, guide):
     """Settings with λ of a whole image and h of its whole guide."""
     weights = NonlocalParams(h=automatic_h(np.asarray(guide, np.float32)))
-    return DeconvolutionParams(fidelity=whole_image_fidelity(image), weights=weights)
+    return DeconvolutionParams(fidelity=whole_image_fidelity(image, DeconvolutionParams()), weights=weights)
 
 
 def test_the_fidelity_of_tiles_is_that_of_the_whole():

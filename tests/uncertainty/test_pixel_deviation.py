@@ -51,9 +51,9 @@ def test_gain_of_all_frequencies_is_that_of_a_full_transform():
 def test_the_weight_of_the_data_is_that_which_was_used(method):
     image = picture("camera", 48, 48)
     automatic = automatic_fidelity(method, image, estimate_noise(image))
-    usual = quadratic_fidelity(image, method, automatic)
+    usual = quadratic_fidelity(image, method, automatic, estimate_noise(image))
     assert usual == pytest.approx(wiener_fidelity(image, estimate_noise(image)))
-    assert quadratic_fidelity(image, method, 3 * automatic) == pytest.approx(3 * usual)
+    assert quadratic_fidelity(image, method, 3 * automatic, estimate_noise(image)) == pytest.approx(3 * usual)
     assert posterior_gain((48, 48), 3 * usual, 1.5, None) > 1.5 * posterior_gain((48, 48), usual, 1.5, None)
 
 

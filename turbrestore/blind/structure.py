@@ -60,7 +60,7 @@ class StructureReading:
     unseen: float  # share of the edges of the image that fewer than half of the registered frames have
     # Variance over the registered frames, relative to that over the frames as they are, both without noise.
     left: float
-    lasting: float  # share of the variance over the registered frames that their mean has too, as it lasts
+    lasting: float = 0.0  # share of the variance over the registered frames that their mean has too, as it lasts
 
     @property
     def explained(self) -> bool:

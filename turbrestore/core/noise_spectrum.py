@@ -54,6 +54,11 @@ class NoiseSpectrum:
         """N at some frequencies, cycles per pixel; beyond the last ring it stays the same."""
         return np.interp(frequency, RINGS, self.power)
 
+    @property
+    def certain(self) -> Float64Array:
+        """N less two standard errors, (rings,): of scenes without flat parts, hardly anything."""
+        return np.maximum(self.power - 2 * self.error, 0.0)
+
     def scaled(self, factor: float) -> NoiseSpectrum:
         """Return the spectrum of the same noise with its variance multiplied."""
         return NoiseSpectrum(self.power * factor, self.error * factor, self.relative * factor)
@@ -112,21 +117,21 @@ def _starts(length: int, side: int) -> NDArray[np.int_]:
 def _fit_ring(difference: Float64Array, scene: Float64Array) -> tuple[float, float, float]:
     """N, its standard error and e from the powers of a ring in every window."""
     # Windows without detail, of which there are usually some, start the rounds.
-    noise, relative = float(np.median(difference)), 0.0
+    noise, relative, spread = float(np.median(difference)), 0.0, 0.0
     weights = np.ones_like(difference)
     for _ in range(_ROUNDS):
         weights = 1 / np.square(noise + relative * scene + _LEAST)
         one, by_scene, by_square = weights.sum(), (weights * scene).sum(), (weights * scene**2).sum()
         of_noise, of_both = (weights * difference).sum(), (weights * scene * difference).sum()
         determinant = one * by_square - by_scene**2
-        noise, relative = of_noise / one, 0.0
+        noise, relative, spread = of_noise / one, 0.0, 1 / one
         if determinant > 1e-9 * one * by_square:
-            noise = (by_square * of_noise - by_scene * of_both) / determinant
+            noise, spread = (by_square * of_noise - by_scene * of_both) / determinant, by_square / determinant
             relative = (one * of_both - by_scene * of_noise) / determinant
         if noise < 0:
             noise, relative = 0.0, of_both / by_square
         elif relative < 0:
             noise, relative = of_noise / one, 0.0
     residual = np.sqrt(weights) * (difference - noise - relative * scene)
-    error = np.sqrt(np.square(residual).mean() / max(weights.sum(), 1e-300))
+    error = np.sqrt(np.square(residual).mean() * spread)
     return float(noise), float(error), float(min(relative, 1.0))

@@ -280,7 +280,7 @@ def deconvolve_steps(
 
 
 def whole_image_fidelity(
-    image: ArrayLike, params: DeconvolutionParams, sigma: float, spectrum: NoiseSpectrum | None
+    image: ArrayLike, params: DeconvolutionParams, sigma: float = 0.0, spectrum: NoiseSpectrum | None = None
 ) -> float:
     """Weight λ of the data for an image (H, W[, 3]), so that its tiles can have the same."""
     return _noise_and_fidelity(split_planes(check_image(image), params.channels), params, sigma, spectrum)[1]

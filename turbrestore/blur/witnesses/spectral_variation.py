@@ -9,9 +9,9 @@ s_4 : ``Var |F|² / (E |F|²)²``, the same of powers, which a shift of a window
 ε : root mean square of the derivatives of the flow, by which registration stretches a blur
 
 The scene cancels in both ratios.  Both are means over a ring of frequencies and over windows that are weighted by their
-power.  The noise of a frame, which the ratios must not contain, is known at every frequency
-(:mod:`turbrestore.registration.registered_noise`).  At the highest frequencies, at which no signal is left, whatever
-varies is noise; what exceeds the known noise there is added to it at all frequencies.
+power.  The ratios must not contain the noise.  At the highest frequencies, at which no signal is left, whatever varies
+is noise, and white noise is interpolated by the registration, which tells the rest of its spectrum.  Smooth noise has
+more at low frequencies, as the flat parts of the frames show (:mod:`turbrestore.registration.registered_noise`).
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray, luminance
+from ...core.noise_spectrum import RINGS as NOISE_RINGS
 from ...core.noise_spectrum import NoiseSpectrum
 from ...registration.warp import sample_splines
 from ...runtime.image_stacks import spline_planes
@@ -36,8 +37,8 @@ SIDE, _BORDER = 64, 16
 _WINDOWS, _FRAMES = 5, 48
 # Fewest frames that are compared.
 _FEWEST = 4
-# Frames whose flows tell the stretch, and highest rings, at which no signal is left.
-_STRETCHES, _NOISE_RINGS = 4, 4
+# Frames by whose flows white noise is warped, and highest rings, at which no signal is left.
+_NOISE_FRAMES, _NOISE_RINGS = 4, 4
 # Least power of the noise: a standard deviation of 10⁻⁴ under the window.
 _LEAST_NOISE = 1e-8 * SIDE**2 * 9 / 64
 # Frequencies of the rings, cycles per pixel.
@@ -91,9 +92,10 @@ def measure_variation(
     if len(frames) < _FEWEST or not corners:
         return None
     picked = np.linspace(0, len(frames) - 1, min(len(frames), _FRAMES)).round().astype(int)
-    sums, stretches, every = [], [], -(-len(picked) // _STRETCHES)
+    rng, sums, stretches, responses = np.random.default_rng(0), [], [], []
+    every = -(-len(picked) // _NOISE_FRAMES)
     for top, left in corners:
-        spectra = []
+        spectra, white = [], []
         for count, number in enumerate(picked):
             found = _around(frames[number], flows[number], top, left, reduction)
             if found is None:
@@ -101,18 +103,21 @@ def measure_variation(
             plane, flow = found
             spectra.append(_spectrum(_warped(plane, flow)))
             if count % every == 0:
+                white.append(_spectrum(_warped(rng.standard_normal(plane.shape).astype(np.float32), flow)))
                 smooth = cv2.GaussianBlur(flow, (0, 0), _SMOOTH)
                 stretches.append(float(np.mean([np.square(np.diff(smooth, axis=axis)).mean() for axis in (0, 1)])))
-        if len(spectra) >= _FEWEST and stretches:
+        if len(spectra) >= _FEWEST and white:
             sums.append(_sums(np.array(spectra)))
+            responses.append(_by_ring(np.square(np.abs(np.array(white))).mean(axis=0)))
         drop_pages(frames)
         drop_pages(flows)
     if not sums:
         return None
+    response = np.mean(responses, axis=0)
     # Means of pixels keep the power of the noise for each area, and spectra here are not normalised.
-    power = noise.at(RINGS / reduction) / reduction**2 * np.square(_profile()).sum()
-    excess = float(np.median((np.mean(sums, axis=0)[0] - power)[-_NOISE_RINGS:]))
-    power = np.maximum(power + max(excess, 0.0), _LEAST_NOISE)
+    smooth_noise = np.interp(RINGS / reduction, NOISE_RINGS, noise.certain) / reduction**2 * np.square(_profile()).sum()
+    white_noise = response * float(np.median((np.mean(sums, axis=0)[0] / response)[-_NOISE_RINGS:]))
+    power = np.maximum(np.maximum(white_noise, smooth_noise), _LEAST_NOISE)
     return _ratios(np.array(sums), power, len(picked), float(np.mean(stretches)), reduction)
 
 

@@ -1,0 +1,139 @@
+"""What the training frames say about the filtered image: whether they have its structure, its noise, and its blur.
+
+It is gathered while the training frames are in memory, and used when they are gone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .agreement.last_guard import Guarded, keep_agreed
+from .blind.remove_blur import Deblurred
+from .blind.structure import compare_structure
+from .blur.posterior import BlurWitnesses, measure_witnesses
+from .blur.psf import GAUSSIAN
+from .blur.witnesses.short_exposure import displacement_variance
+from .core.arrays import FloatArray, luminance
+from .core.decision import Decision
+from .core.noise import NoiseCurve, photon_noise
+from .core.noise_spectrum import NoiseSpectrum
+from .deconvolution.conjugate_gradient import wiener_filtered
+from .fusion import Run
+from .registration.flow_algebra import invert_flow
+from .registration.recentring import recentring_flow
+from .registration.registered_noise import HalvedClip, Halves, halve
+from .registration.warp import warp
+from .results import Restoration
+from .runtime.scratch import iter_frames
+from .seeing.strength import Seeing
+from .wording import FEW_FRAMES, explain_few_frames, explain_structure
+
+# Least variance of the noise of dark parts, relative to that of bright ones, that the decision states.
+_LEAST_SHARE = 0.01
+# Least standard deviation of ln V, the displacement that D/r0 implies: theory and simulated clips agree no better.
+_LEAST_SPREAD = 0.2
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What the deblurring needs to know from the training frames, which are freed before it runs."""
+
+    saturation: float  # intensity from which the mean is saturated
+    is_mean: bool = False  # whether the mean replaces the filtered image, which has structure that the frames lack
+    finds_blur: bool = True  # whether a blur is looked for
+    witnesses: BlurWitnesses | None = None  # None if no blur is to be estimated
+    halves: HalvedClip | None = None  # None then
+
+
+def evidence_of_frames(
+    run: Run, fused: Restoration, training: FloatArray, mean_flow: FloatArray, saturation: float
+) -> tuple[Restoration, Evidence]:
+    """Check that the frames have the structure of the filtered image, else take the mean; measure how blurred it is."""
+    image, flows = luminance(fused.image), fused.centroid.flows
+    if mean_flow.any():
+        # The flows start from the geometry of the centroid.
+        image = warp(image, invert_flow(recentring_flow(mean_flow)))
+    halves = halve(training, flows, training.shape[1:], len(training), run.plan.runtime.threads)
+    new, lasting = halves.alternate.noise().deviation ** 2, halves.lasting.noise().deviation ** 2
+    structure = compare_structure(image, training, flows, len(training) * new, max(lasting - new, 0.0))
+    run.decide(*explain_structure(structure))
+    if not structure.explained:
+        return replace(fused, image=fused.mean), Evidence(saturation, is_mean=True)
+    # No guard overrides a width that was asked for.
+    if not run.params.finds_blur:
+        return fused, Evidence(saturation)
+    if structure.changes or len(training) < FEW_FRAMES:
+        run.decide(*explain_few_frames(len(training)))
+        return fused, Evidence(saturation, finds_blur=False)
+    witnesses, halves = _find_witnesses(run, training, fused, halves.alternate.mean), halves.recentred(mean_flow)
+    witnesses = replace(witnesses, noise=_fused_noise(fused, halves))
+    return fused, Evidence(saturation, witnesses=witnesses, halves=halves)
+
+
+def _fused_noise(fused: Restoration, halves: HalvedClip) -> NoiseSpectrum:
+    """Noise of the filtered image: that of the mean of the training frames, for as many frames as its weights leave."""
+    noise, filtered = halves.noise(), fused.filtered
+    if filtered is None:
+        return noise
+    # Σ / Z₀ is one over the number of frames that count.
+    counting = filtered.image_noise / max(float(filtered.variance.mean()), 1e-12)
+    return noise.scaled(halves.count / counting * filtered.noise_gain)
+
+
+def _find_witnesses(run: Run, training: FloatArray, fused: Restoration, mean: FloatArray) -> BlurWitnesses:
+    """Measure what the frames say about their blur; ``mean`` (H, W[, 3]) is that of the registered frames."""
+    seeing = fused.seeing
+    measured = None if seeing is None else seeing.displacement_variance
+    rows, columns = picture = run.prepared.picture
+    with run.timed("witnesses"):
+        cropped, flows = training[:, rows, columns], fused.centroid.flows[:, rows, columns]
+        if seeing is not None and measured is not None:
+            displacement, frames = measured.value, seeing.independent_frames
+        else:
+            # Where no displacement can be measured, that of the flow is taken instead, less what the camera adds.
+            variances = [np.square(flow - np.median(flow, axis=(0, 1))).mean() for flow in iter_frames(flows)]
+            displacement, frames = float(np.mean(variances)), float(len(training))
+        known = BlurWitnesses(displacement, frames, picture)
+        return measure_witnesses(cropped, flows, mean[rows, columns], _of_optics(known, run, seeing))
+
+
+def _of_optics(known: BlurWitnesses, run: Run, seeing: Seeing | None) -> BlurWitnesses:
+    """Add the diffraction of the optics and, if D/r0 is measured, the displacement that it implies."""
+    optics = run.params.optics
+    if optics is None:
+        return known
+    strength, diffraction = None if seeing is None else seeing.d_over_r0, optics.diffraction
+    if optics.distance is None or strength is None or not np.isfinite(strength.high):
+        return replace(known, diffraction=diffraction)
+    implied = float(displacement_variance(np.array(strength.value), np.array(diffraction)))
+    # V grows as the power 5/3 of D/r0, and a 95 % interval has four standard deviations.
+    spread = max(5 / 3 * np.log(strength.high / strength.low) / 4, _LEAST_SPREAD)
+    return replace(known, displacement=implied, diffraction=diffraction, spread=float(spread))
+
+
+def agreed_image(run: Run, fused: Restoration, deblurred: Deblurred, halves: HalvedClip) -> Guarded:
+    """Compare the halves of the clip behind the deconvolution of the image, and keep what they agree on."""
+    done, posterior = deblurred.deconvolution, deblurred.posterior
+
+    def sharpened(half: FloatArray) -> FloatArray:
+        grey = luminance(half)
+        if done.sigma == 0:
+            return grey
+        return wiener_filtered(grey, done.sigma, GAUSSIAN if posterior is None else posterior.exponent, done.noise)
+
+    pairs = halves.alternate, halves.lasting
+    sharp = [Halves(sharpened(pair.first), sharpened(pair.second)) for pair in pairs]
+    mean = halves.alternate.mean
+    return keep_agreed(done.image, mean, halves.noise(), sharp, run.prepared.levels.full_scale)
+
+
+def measure_photon_noise(run: Run, halves: Halves) -> NoiseCurve | None:
+    """Measure how the noise of the image depends on its level."""
+    curve = photon_noise(luminance(halves.first), luminance(halves.second))
+    if curve is not None:
+        times = float(curve.variances[-1] / max(curve.variances[0], _LEAST_SHARE * curve.variances[-1]))
+        reason = f"its variance is {times:.0f} times as large where the scene is bright, as that of photons"
+        run.decide(Decision("noise", "dark parts count more than bright ones in the deconvolution", reason))
+    return curve
