@@ -222,15 +222,8 @@ def keep_all(report: ContentReport) -> ContentReport:
     if backdrop is not None and len(report.scenes) > 1:
         # The backdrop is that of one scene; it must not show in the others.
         backdrop = dataclasses.replace(backdrop, black_borders=False)
-    kept = dataclasses.replace(
-        report,
-        blank=(),
-        overexposed=(),
-        duplicated=(),
-        scenes=report.scenes[:1],
-        left_out=frozenset(),
-        backdrop=backdrop,
-    )
+    nothing = dataclasses.replace(report, blank=(), overexposed=(), duplicated=(), left_out=frozenset())
+    kept = dataclasses.replace(nothing, scenes=report.scenes[:1], backdrop=backdrop)
     return dataclasses.replace(kept, warnings=tuple(_in_words(kept, False)))
 
 
