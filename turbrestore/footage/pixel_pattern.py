@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..core.gradient import sobel_gradient
+from ..core.robust import robust_scale
 from ..io.source import Window
 from .placement import relative_window
 from .survey import Moments, Survey
@@ -45,7 +46,6 @@ class _Limits:
     steep: float = 0.9  # quantile of the slopes from which s is measured
     outlier: float = 5.0  # deviations of P beyond which a pixel is of an overlay; white noise reaches 4.5
     high: float = 0.25  # cycles per pixel from which frequencies are high: half of the range
-    normal: float = 1.4826  # standard deviation of normal numbers in median absolute ones
     window: int = 4  # frames before and after a cut that are compared
     changed: float = 2.0  # least change of P at a cut, as a variance relative to what frames differ by elsewhere
     pixels: int = 1 << 16  # about how many pixels are compared at cuts
@@ -182,7 +182,7 @@ def _usual(fine: FloatArray) -> NDArray[np.bool_]:
 
 
 def _deviation(fine: FloatArray) -> float:
-    return _LIMITS.normal * float(np.median(np.abs(fine)))
+    return robust_scale(fine)
 
 
 def _squared_slope(image: FloatArray) -> FloatArray:

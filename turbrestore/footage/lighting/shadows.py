@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray
 from ...core.decision import Decision
+from ...core.robust import bisquare_weights, robust_scale
 from ...io.source import Window
 from ...registration.camera.global_shift import known_shifts
 
@@ -101,7 +102,6 @@ def _field(f: FloatArray, r: FloatArray, reach: float) -> tuple[FloatArray, NDAr
         field = np.where(known, over / np.where(known, under, 1), 1).astype(np.float32)
         field = np.clip(field, 1 / _LARGEST, _LARGEST)
         residual = f - field * r
-        scale = 1.4826 * float(np.median(np.abs(residual)))
-        weights = (np.clip(1 - (residual / max(4.685 * scale, 1e-6)) ** 2, 0, 1) ** 2).astype(np.float32) + 1e-3
+        weights = bisquare_weights(residual, robust_scale(residual), 1e-6).astype(np.float32) + 1e-3
     squares = [float((weights * part**2).sum()) for part in (f - r, residual)]
     return field, np.array(squares)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray, luminance
 from ...core.decision import Decision
+from ...core.robust import bisquare_weights, robust_scale
 from ...registration.camera.global_shift import known_shifts
 from ..placement import reduce_frames
 from ..survey import Survey
@@ -84,10 +85,10 @@ def _gain(values: FloatArray, reference: NDArray[np.float64], usable: NDArray[np
     f, r = values[usable].astype(np.float64), reference[usable]
     if f.size < 16:
         return 1.0
-    weights, gain = np.ones(f.size), 1.0
+    weights: NDArray[np.floating] = np.ones(f.size)
+    gain = 1.0
     for _ in range(_ROUNDS):
         gain = float((weights * r * f).sum() / max(float((weights * r * r).sum()), 1e-12))
         residual = f - gain * r
-        scale = 1.4826 * float(np.median(np.abs(residual)))
-        weights = np.clip(1 - (residual / max(4.685 * scale, 1e-9)) ** 2, 0, 1) ** 2
+        weights = bisquare_weights(residual, robust_scale(residual), 1e-9)
     return max(gain, 1e-3)
