@@ -8,8 +8,8 @@ s : motion of the edges of the scene, pixels
 
 Stripes of the scene move with the air, so v exceeds n² by s² times the squared slope of c.  Those of the sensor stay,
 and do not raise v.  They are subtracted from every frame; a column that does not change while others do is filled from
-beside it.  Rows are the columns of the transposed frames.  A warm pixel exceeds its surroundings in m by itself, as no
-detail does that moves, and does not vary by its height times the motion.
+beside it.  Rows are the columns of the transposed frames.  A warm pixel stands out alone in m and does not flicker as
+moving detail of its height would.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _FEWEST = 8
 _ACROSS = 3.0
 # Least offset, in standard errors of the mean of the frames and in intensity, that is worth a correction.
 _CLEARLY, _LEAST = 4.0, 5e-4
-# Largest share, of the variance that stripes of the scene would have, of those of the sensor.
+# Stripes of the sensor vary by less than this share of what moving stripes would.
 _STATIC = 0.25
 # Gradient of the edges whose motion is measured, in deviations of the noise, and the least motion, pixels.
 _EDGE, _LEAST_MOTION = 8.0, 0.3
@@ -114,7 +114,7 @@ def _motion(mean: FloatArray, variance: FloatArray, noise: float) -> float:
 
 
 def _offsets(mean: FloatArray, variance: FloatArray, error: float, motion: float) -> FloatArray:
-    """Offset of every column, and of all or none, as they belong to the sensor or to the scene."""
+    """Column offsets; all zero if they belong to the scene."""
     fine = mean - cv2.GaussianBlur(mean, (0, 0), sigmaX=_ACROSS, sigmaY=1e-3)
     offsets = np.median(fine, axis=0).astype(np.float32)
     size = float(np.sqrt(np.mean(np.median(np.abs(offsets)) ** 2)))
