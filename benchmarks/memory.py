@@ -236,7 +236,7 @@ class StageWatch(Watch):
         """Return None: nothing was kept."""
 
     def checkpoint(self, state: object) -> None:
-        """Let the state go."""
+        """Discard the checkpoint."""
 
 
 def measure_stages(clip: Clip, threads: int, method: str) -> None:

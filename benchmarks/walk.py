@@ -33,6 +33,7 @@ from unittest.mock import patch
 
 import numpy as np
 
+import turbrestore
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames
 from turbrestore_cli.__main__ import main as command
@@ -161,6 +162,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--files", action="store_true", help="list the files with most stays")
     options = parser.parse_args()
+    if Path(turbrestore.__file__).parents[1] != ROOT:
+        sys.exit(f"expected an editable installation of {ROOT}, found {turbrestore.__file__}; install it with pip -e")
     walk, found = figures()
     for name, value in found.items():
         bound = f", at most {BOUNDS[name]:g}" if name in BOUNDS else ""

@@ -134,33 +134,6 @@ def blurred(
     return (soft + rng.normal(0, noise, scene.shape)).astype(np.float32)
 
 
-def moving_blur(
-    scene: np.ndarray, count: int, rng: np.random.Generator, low: float = 0.6, high: float = 2.4, noise: float = 0.01
-) -> tuple[np.ndarray, np.ndarray]:
-    """Frames whose σ varies from ``low`` to ``high`` in time and across the image, and their variance."""
-    height, width = scene.shape
-    levels = np.linspace(low, high, 13)
-    stack = np.stack([cv2.GaussianBlur(scene, (0, 0), level) for level in levels])
-    ends = rng.uniform(0, 1, (count, 2, 2)).astype(np.float32)
-    share = np.stack([cv2.resize(end, (width, height), interpolation=cv2.INTER_LINEAR) for end in ends])
-    variance = low**2 + (high**2 - low**2) * share
-    place = np.interp(variance, levels**2, np.arange(13.0))
-    lower = np.minimum(place.astype(int), 11)
-    frames = [
-        (1 - (p - i)) * np.take_along_axis(stack, i[None], 0)[0]
-        + (p - i) * np.take_along_axis(stack, i[None] + 1, 0)[0]
-        for p, i in zip(place, lower, strict=True)
-    ]
-    return (np.stack(frames) + rng.normal(0, noise, place.shape)).astype(np.float32), variance
-
-
-@pytest.fixture(scope="session")
-def varied() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A scene, frames of it whose blur varies in time and space, and the variance of that blur."""
-    scene = SCENES["camera"](144)
-    return scene, *moving_blur(scene, 40, np.random.default_rng(0))
-
-
 @pytest.fixture(scope="session")
 def clip(tmp_path_factory):
     """A short video whose frames bend, for tests that read it and leave it as it is."""

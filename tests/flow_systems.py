@@ -3,6 +3,8 @@
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
+from turbrestore.filtering.estimates import Gaussian
+
 
 def rotation(angle: float, modulus: float) -> np.ndarray:
     return modulus * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -17,6 +19,13 @@ def run_system(A, Q, length, rng, runs=1):
     for k in range(length - 1):
         states[..., k + 1] = states[..., k] @ A.T + noise[:, k]
     return states
+
+
+def textbook_update(state, z, H, R):
+    """Update of a Gaussian state as paper 3 prints it, (17) and (18)."""
+    M = state.cov @ H.T @ np.linalg.inv(H @ state.cov @ H.T + R)
+    cov = state.cov - M @ H @ state.cov
+    return Gaussian(state.mean + M @ (z - H @ state.mean), (cov + cov.T) / 2)
 
 
 def orthonormal(shape, n, rng):

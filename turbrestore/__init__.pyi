@@ -1,10 +1,5 @@
 from .blur.estimation import BlurEstimate as BlurEstimate
 from .blur.estimation import estimate_blur as estimate_blur
-from .blur_moments.cues import displacement_variance as displacement_variance
-from .blur_moments.cues import relative_blur as relative_blur
-from .blur_moments.frame_blur import frame_blur as frame_blur
-from .blur_moments.tracking import TrackParams as TrackParams
-from .blur_moments.tracking import track_blur as track_blur
 from .core.decision import Decision as Decision
 from .core.errors import TurbrestoreError as TurbrestoreError
 from .deconvolution.deconvolve import Deconvolution as Deconvolution
@@ -58,6 +53,7 @@ from .runs.run_record import describe_run as describe_run
 from .runs.stage_files import load_artifact as load_artifact
 from .runs.stage_files import save_artifact as save_artifact
 from .runtime.runtime import Runtime as Runtime
+from .seeing.relative_blur import relative_blur as relative_blur
 from .seeing.strength import Estimate as Estimate
 from .seeing.strength import Seeing as Seeing
 from .seeing.strength import measure_seeing as measure_seeing

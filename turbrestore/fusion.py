@@ -119,7 +119,7 @@ class Run:
             return self.from_store(name, compute)
 
     def from_store(self, name: str, compute: Callable[[], Result]) -> Result:
-        """Do the same without taking the time, within a stage."""
+        """Like :meth:`stage`, untimed."""
         return compute() if self.store is None else self.store.get(name, compute)
 
     def counter(self, stage: str, total: int) -> Callable[[object], None]:

@@ -49,7 +49,7 @@ _FEWEST_IN_NEED = 10
 # Most that training frames and their flows take where no limit is given, bytes.
 _TRAINING_BYTES = 1.5e9
 # Peak without a limit from which training frames go to a scratch file, bytes; required free space as a multiple of it.
-_MUCH, _ROOM = 2.2e9, 3
+_SPILL_ABOVE_BYTES, _FREE_SPACE_FACTOR = 2.2e9, 3
 # Interpreter, libraries and readers, bytes.
 _BASE = 1.6e8
 # Memory of the preparation, bytes a pixel and bytes a pixel and channel.
@@ -61,9 +61,9 @@ _RESULTS_OF_TILES, _RESULTS_OF_TILES_COLOUR = 3, 23
 # A report with its pictures, which are at most 2048 pixels wide: bytes, bytes a pixel and a pixel that is shown.
 _REPORT, _REPORT_PIXEL, _REPORT_SHOWN, _SHOWN_SIDE = 6e7, 40, 50, 2048
 # Elements of the modes that a thread holds while they lie in a file.
-_IN_HAND = 1 << 23
+_MODE_ELEMENTS_PER_THREAD = 1 << 23
 # Side of a tile below which one thread is used, and the step in which sides are tried, pixels.
-_WORTH, _SIDE_STEP = 640, 32
+_ONE_THREAD_BELOW, _SIDE_STEP = 640, 32
 # The size of the tiles changes the result, so it must not depend on the number of cores.
 _THREADS_OF_TILES = 2
 
@@ -128,8 +128,8 @@ def _without_limit(
     """Keep the training frames in a scratch file if memory takes much and the disk has room; no result changes."""
     in_file, folder = replace(choice, in_scratch=True), runtime.scratch
     size = _scratch_bytes(shape, params, in_file)
-    much = base + _peak(shape, params, choice, math.inf) > _MUCH
-    if not much or folder is None or not _has_room(folder, _ROOM * size):
+    much = base + _peak(shape, params, choice, math.inf) > _SPILL_ABOVE_BYTES
+    if not much or folder is None or not _has_room(folder, _FREE_SPACE_FACTOR * size):
         return MemoryPlan(choice.train, replace(runtime, scratch=None))
     decisions = tuple(_decisions(shape, params, in_file, choice, base, math.inf))
     return MemoryPlan(choice.train, runtime, scratch_bytes=size, decisions=decisions)
@@ -181,9 +181,9 @@ def _choices(
     if tile is not None:
         yield _tiles_of(shape, train, _THREADS_OF_TILES, tile)
         longest = tile
-    for side in reversed(range(_WORTH, longest, _SIDE_STEP)):
+    for side in reversed(range(_ONE_THREAD_BELOW, longest, _SIDE_STEP)):
         yield _tiles_of(shape, train, _THREADS_OF_TILES, side)
-    for side in reversed(range(4 * HALO, min(_WORTH, longest), _SIDE_STEP)):
+    for side in reversed(range(4 * HALO, min(_ONE_THREAD_BELOW, longest), _SIDE_STEP)):
         yield _tiles_of(shape, train, 1, side)
 
 
@@ -200,7 +200,7 @@ def _peak(shape: tuple[int, ...], params: RestoreParams, choice: _Choice, budget
     frames, flows, modes = _stack(part, params, train)
     if choice.in_scratch:
         in_hand = (2 * threads + 2) / train
-        frames, flows, modes = frames * in_hand, flows * in_hand, min(modes, 4.0 * _IN_HAND * threads)
+        frames, flows, modes = frames * in_hand, flows * in_hand, min(modes, 4.0 * _MODE_ELEMENTS_PER_THREAD * threads)
     # The sum of the frames; in tiles the frame that is being read, while the other images of the whole lie in files.
     held = frames + flows + (8.0 if choice.tile is None else 10.5) * _pixels(shape) * _channels(shape)
     flow, side = flow_memory(part, threads), _deconvolution_side(shape, params, choice, budget)

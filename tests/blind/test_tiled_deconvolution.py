@@ -24,7 +24,7 @@ def brick():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("method", "iterations"), [("nltv", 50), ("tv", 200), ("wiener", 200), ("tikhonov", 200)])
+@pytest.mark.parametrize(("method", "iterations"), [("nltv", 30), ("tv", 100), ("wiener", 200), ("tikhonov", 200)])
 def test_tiles_are_as_good_as_the_whole_image(brick, method, iterations):
     scene, image = brick
     tiles, params = halo_tiles(image.shape, side=200, halo=40), DeconvolutionParams(method, iterations=iterations)

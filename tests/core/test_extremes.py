@@ -11,7 +11,7 @@ from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
 from turbrestore.filtering.estimates import Gaussian, PixelStacks
 from turbrestore.filtering.image_state import predict_image, update_image
-from turbrestore.filtering.kalman import predict, update_information_form
+from turbrestore.filtering.kalman import predict, update
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams
 
@@ -122,7 +122,7 @@ def walk(seed, radius, noises, seen, steps, every):
     for step, noise in enumerate(10.0 ** rng.uniform(-9, 4, steps)):
         state = predict(state, A, Q)
         if measured[step]:
-            state, _ = update_information_form(state, values[step], C, noise)
+            state = update(state, values[step], C, noise)
         assert (state.cov == state.cov.T).all()
         if step % every == every - 1:
             assert np.linalg.eigvalsh(state.cov).min() > 0, step

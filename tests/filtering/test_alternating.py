@@ -4,6 +4,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from flow_systems import textbook_update
 
 from conftest import make_sequence
 from turbrestore.core.errors import ConfigurationError, DataError
@@ -12,7 +13,7 @@ from turbrestore.filtering.alternating import filter_frames, filter_steps
 from turbrestore.filtering.estimates import Gaussian, PixelStacks
 from turbrestore.filtering.filter_records import FilterParams, filter_memory
 from turbrestore.filtering.image_state import update_image
-from turbrestore.filtering.kalman import predict, update_covariance_form
+from turbrestore.filtering.kalman import predict
 from turbrestore.metrics import psnr
 from turbrestore.registration.centroid import find_centroid
 from turbrestore.registration.warp import warp
@@ -100,7 +101,7 @@ def test_in_the_subspace_it_is_the_linear_kalman_filter(sequence):
         missed = (model.C @ (xi - predict(flow, model.A, model.Q).mean).astype(np.float32)).astype(np.float64)
         assert unforeseen == pytest.approx(np.sqrt(np.mean(missed**2)), rel=1e-3)
         # With CᵀC = I the measurement Cᵀ(W − W̄) = ξ + Cᵀr says all that W does.
-        flow, _ = update_covariance_form(predict(flow, model.A, model.Q), xi, np.eye(rank), model.R * np.eye(rank))
+        flow = textbook_update(predict(flow, model.A, model.Q), xi, np.eye(rank), model.R * np.eye(rank))
         assert np.allclose(found, flow.mean, rtol=1e-4, atol=1e-4)
         estimate = model.mean_flow + (model.C @ flow.mean.astype(np.float32)).reshape(96, 96, 2)
         image, _ = update_image(image, warp(frame, estimate), noise)

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from flow_systems import uneven_flows
+from flow_systems import textbook_update, uneven_flows
 
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
 from turbrestore.dynamics.flow_model import flow_of, project_measured
 from turbrestore.filtering.estimates import Gaussian
 from turbrestore.filtering.flow_state import advance_flow_state, update_flow_state
-from turbrestore.filtering.kalman import predict, update_covariance_form
+from turbrestore.filtering.kalman import predict
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def test_the_projected_update_is_that_of_the_whole_flow(rng, dynamics):
         whole = predict(whole, dynamics.A, dynamics.Q)
         expected = (flow - flow_of(dynamics, whole.mean)).ravel()
         state, innovation = advance_flow_state(state, project_measured(flow, dynamics), dynamics)
-        whole, _ = update_covariance_form(whole, (flow - dynamics.mean_flow).ravel(), C, R)
+        whole = textbook_update(whole, (flow - dynamics.mean_flow).ravel(), C, R)
         np.testing.assert_allclose(state.mean, whole.mean, rtol=1e-5, atol=1e-5)
         np.testing.assert_allclose(state.cov, whole.cov, rtol=1e-5, atol=1e-6 * whole.cov.max())
         assert innovation == pytest.approx(np.sqrt(np.mean(expected.astype(np.float64) ** 2)), rel=1e-4)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from conftest import photograph, surveyed
-from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.footage.background import without_moving_objects
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
@@ -22,11 +21,9 @@ COUNT, SIDE = 40, 128
 
 
 @functools.cache
-def clip(scene, objects=0, channels=1, d_over_r0=2.5):
+def clip(scene, objects=0, d_over_r0=2.5):
     """Frames with and without objects, which several tests look at."""
     truth = SCENES[scene](SIDE, SIDE)
-    if channels == 3:
-        truth = truth[..., None] * np.float32([1.0, 0.8, 0.6])
     moving = draw_objects(objects, truth.shape, np.random.default_rng(5))
     params = PhaseScreenParams(d_over_r0)
 
@@ -42,7 +39,9 @@ def clip(scene, objects=0, channels=1, d_over_r0=2.5):
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_frames_show_the_background_behind_moving_objects(channels):
-    frames, empty = clip("brick", 3, channels)
+    frames, empty = clip("brick", 3)
+    if channels == 3:
+        frames, empty = (some[..., None] * np.float32([1.0, 0.8, 0.6]) for some in (frames, empty))
     cleaned, (decision,) = without_moving_objects(surveyed(frames))
     cleaned = cleaned.read()
     covered = np.abs(frames - empty).reshape(*empty.shape[:3], -1).max(axis=3) > 0.1
@@ -56,8 +55,8 @@ def test_frames_show_the_background_behind_moving_objects(channels):
 
 def test_the_image_is_that_of_the_clip_without_objects():
     frames, empty = clip("brick", 3)
-    # Of one blur, because the widths that are measured differ.
-    params = RestoreParams(deconvolution=DeconvolutionParams(sigma=1.0))
+    # Before the deconvolution, because the widths that are measured differ.
+    params = RestoreParams(until="filter")
     with_objects, without = (restore(some, params).image for some in (frames, empty))
     assert compare(with_objects, without).psnr > 30
 
@@ -68,7 +67,7 @@ def test_a_window_of_a_frame_is_cleaned_as_the_whole_frame_is():
     assert np.array_equal(whole[:, 10:110, 20:110], part)
 
 
-@pytest.mark.parametrize("scene", ["camera", "chart", "brick"])
+@pytest.mark.parametrize("scene", ["chart", "brick"])
 def test_turbulence_is_no_moving_object(scene):
     survey = surveyed(clip(scene, d_over_r0=5.0)[1])
     assert without_moving_objects(survey) == (survey.clip, ())

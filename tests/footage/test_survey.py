@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence, surveyed
-from turbrestore.footage.survey import spread, survey_memory, survey_scratch_bytes, take_survey
+from turbrestore.core.robust import spread
+from turbrestore.footage.survey import survey_memory, survey_scratch_bytes, take_survey
 from turbrestore.io.source import FrameSource
 from turbrestore.pipeline import restore
 from turbrestore.preparation import prepare

@@ -7,22 +7,17 @@ import numpy as np
 from ..blur.estimation import BlurEstimate
 from ..blur.posterior import BlurPosterior
 from ..core.decision import Decision
-from .blur_map import BlurMap
 from .guards import GuardParams, GuardReading
 
 # Probability from which the air is said to have blurred the image.
 _MOSTLY = 0.8
 
 
-def explain_blur(
-    blur: BlurEstimate | None, sigma: float, blur_map: BlurMap | None = None, given: str = "asked for"
-) -> Decision:
+def explain_blur(blur: BlurEstimate | None, sigma: float, given: str = "asked for") -> Decision:
     """Explain which width is removed; ``given`` is the reason if none was estimated."""
     choice = f"{sigma:.2f} pixels removed" if sigma > 0 else "none removed"
     if blur is None:
         return Decision("blur", choice, given)
-    if blur_map is not None and blur_map.varies:
-        choice = f"{blur_map.removable.min():.2f} to {blur_map.removable.max():.2f} pixels removed"
     width = f"{blur.sigma:.2f} ± {blur.uncertainty:.2f} pixels"
     if blur.edge_limited:
         return Decision("blur", choice, f"{width}, edges are too steep for the wider blur that is likeliest")
@@ -57,17 +52,6 @@ def explain_posterior(posterior: BlurPosterior, removed: float) -> Decision:
     if outside:
         reason += f"; outside the measured range: {' and '.join(outside)}"
     return Decision("blur", choice, reason)
-
-
-def explain_blur_map(blur_map: BlurMap | None) -> tuple[Decision, ...]:
-    """Explain whether every pixel gets a width of its own."""
-    if blur_map is None:
-        return ()
-    choice = "a width for every pixel" if blur_map.varies else "one width for the whole image"
-    rows, columns = blur_map.sigmas.shape
-    found = f"{blur_map.sigmas.min():.2f} to {blur_map.sigmas.max():.2f} pixels in {rows}×{columns} tiles"
-    remark = "clearly different" if blur_map.varies else "equal within their uncertainties"
-    return (Decision("blur by tiles", choice, f"{found}, {remark}"),)
 
 
 def explain_guards(sigma: float, readings: tuple[GuardReading, ...], guards: GuardParams) -> tuple[Decision, ...]:

@@ -1,15 +1,12 @@
 """Blind deconvolution: estimate the blur of the fused image, remove it, and check the result.
 
 The width is given or estimated.  A given width is removed whatever the guards say.  From an estimated width on,
-attempts with smaller and smaller widths are made until the guards pass.  If the blur clearly differs between parts of
-the image, each attempt removes a width of its own at every pixel.
+attempts with smaller and smaller widths are made until the guards pass.
 """
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,15 +29,14 @@ from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import to_scratch
 from ..runtime.steps import finish
 from ..runtime.tiling import HALO, HaloTile, add_tile, halo_tiles, largest_tile, new_mosaic
-from .blur_map import BlurMap, blur_map_steps, estimate_blur_map, sigma_map, varying_deconvolution_steps
-from .decisions import explain_blur, explain_blur_map, explain_guards, explain_posterior
+from .decisions import explain_blur, explain_guards, explain_posterior
 from .guards import GuardParams, GuardReading, evaluate_guards
 
 # Bytes per pixel, and per pixel and channel, of what is computed before and after the deconvolution; the guards take
 # most.
 _BYTES, _CHANNEL_BYTES = 22, 2
-# Bytes per pixel of the maps of widths, and per pixel and channel of the results of two attempts.
-_WIDTHS_BYTES, _RESULTS_BYTES = 8, 8
+# Bytes per pixel and channel of the results of two attempts.
+_RESULTS_BYTES = 8
 # The widest blur that is found, pixels, and the least shorter side of an image in widths of its blur: a wider one
 # leaves nothing to restore.
 WIDEST, SIGMAS_A_SIDE = 21.0, 8
@@ -108,33 +104,20 @@ def remove_blur_steps(
         kernel = width if psf is None or width == 0 else psf
         return tiled_deconvolution_steps(image, kernel, params, guide, runtime, in_tiles, photons, full_scale, noise)
 
-    blur_map, widths, first = None, None, None
-    # The likelihood of a tile is unreliable where that of the image is, and where frames tell the blur they decide.
-    if posterior is None and blur is not None and blur.blurred and not blur.edge_limited:
-        blur_map, widths, first = yield from _find_widths(image, blur, remove(sigma), runtime)
-    if widths is not None:
-        sigma = float(widths.max())
-
-    def attempt(width: float) -> Steps[Deconvolution]:
-        if widths is None or width == 0:
-            return remove(width)
-        return varying_deconvolution_steps(remove, widths * (width / sigma), runtime)
-
     if blur is None:
-        result = yield from attempt(sigma)
+        result = yield from remove(sigma)
         readings: tuple[GuardReading, ...] = ()
         if sigma > 0:
             readings = (evaluate_guards(result.image, image, sigma, guards),)
     else:
-        result, readings = yield from guarded_steps(attempt, image, sigma, guards, first)
+        result, readings = yield from guarded_steps(remove, image, sigma, guards)
     on_guards = explain_guards(result.sigma, readings, guards)
     if posterior is not None:
         on_blur = explain_posterior(posterior, result.sigma)
     else:
         given = "asked for" if psf is None else "the point spread function is given"
-        on_blur = explain_blur(blur, sigma, blur_map, given)
-    decisions = (on_blur, *explain_blur_map(blur_map), *on_guards)
-    return Deblurred(result, blur, readings, decisions, posterior)
+        on_blur = explain_blur(blur, sigma, given)
+    return Deblurred(result, blur, readings, (on_blur, *on_guards), posterior)
 
 
 def tiled_deconvolution_steps(
@@ -180,9 +163,7 @@ def remove_blur_memory(shape: tuple[int, ...], params: DeconvolutionParams, side
     part = shape if side is None else (*largest_tile((shape[0], shape[1]), side), *shape[2:])
     beside = float(pixels * (_BYTES + channels * _CHANNEL_BYTES))
     params = params if params.sigma is not None else replace(params, sigma=WIDEST)
-    # Maps of widths, and results of two attempts.
-    images = float(pixels * (_WIDTHS_BYTES + channels * _RESULTS_BYTES))
-    return images + max(beside, deconvolution_memory(part, params, MOST_THREADS))
+    return float(pixels * channels * _RESULTS_BYTES) + max(beside, deconvolution_memory(part, params, MOST_THREADS))
 
 
 def blur_to_remove(
@@ -199,67 +180,17 @@ def guarded_steps(
     blurred: FloatArray,
     sigma: float,
     guards: GuardParams,
-    first: Deconvolution | None = None,
 ) -> Steps[tuple[Deconvolution, tuple[GuardReading, ...]]]:
     """Deconvolve an image (H, W[, 3]) by smaller and smaller widths until the guards pass."""
     readings: list[GuardReading] = []
     while sigma > 0 and len(readings) < guards.tries:
-        if first is None:
-            result = yield from attempt(sigma)
-        else:
-            result, first = first, None
+        result = yield from attempt(sigma)
         readings.append(evaluate_guards(result.image, blurred, sigma, guards))
         if readings[-1].passed:
             return result, tuple(readings)
         sigma *= guards.back_off if len(readings) > 1 else guards.first_back_off(readings[0])
     result = yield from attempt(0.0)
     return result, tuple(readings)
-
-
-def _find_widths(
-    image: FloatArray, blur: BlurEstimate, steps: Steps[Deconvolution], runtime: Runtime
-) -> Steps[tuple[BlurMap | None, FloatArray | None, Deconvolution | None]]:
-    """Find the widths of tiles and, if they differ, a width for every pixel (H, W).
-
-    If they agree, the third is the result of ``steps``, the deconvolution by one width, unless memory is limited.
-    """
-    first = None
-    if runtime.memory_limit is None:
-        blur_map, first = yield from _map_meanwhile(image, blur, steps)
-    else:
-        blur_map = estimate_blur_map(image, blur, runtime)
-    if blur_map is None or not blur_map.varies:
-        return blur_map, None, first
-    return blur_map, sigma_map(blur_map.removable, image.shape[:2]), None
-
-
-def _map_meanwhile(
-    image: FloatArray, blur: BlurEstimate, steps: Steps[Deconvolution]
-) -> Steps[tuple[BlurMap | None, Deconvolution]]:
-    """Estimate the widths of tiles in another thread while the image is deconvolved by one width.
-
-    The estimate keeps one core busy, whereas the deconvolution leaves cores idle now and then; and its result can be
-    used, because the blur rarely varies.
-    """
-    stopped = threading.Event()
-
-    def find_map() -> BlurMap | None:
-        tiles = blur_map_steps(image, blur, Runtime(threads=1))
-        while not stopped.is_set():
-            try:
-                next(tiles)
-            except StopIteration as end:
-                return end.value
-        return None
-
-    with ThreadPoolExecutor(1) as pool:
-        found = pool.submit(find_map)
-        try:
-            result = yield from steps
-            return found.result(), result
-        finally:
-            # After an error, or if the caller leaves, the remaining tiles are not needed.
-            stopped.set()
 
 
 def find_blur(

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.gradient import sobel_gradient
 from ..core.noise import estimate_noise
+from ..core.robust import spread
 from ..registration.warp import inside, warp
 from ..runtime.scratch import drop_pages
 
@@ -81,7 +82,7 @@ def compare_structure(
     ``noise`` is the variance of what is new in every frame, ``lasting`` that of what the mean of the frames has beyond
     the noise of so many independent frames, both squared intensity.
     """
-    picked = np.linspace(0, len(frames) - 1, min(len(frames), _FRAMES)).round().astype(int)
+    picked = spread(len(frames), _FRAMES)
     gradient = _gradient(luminance(image))
     steepness = np.hypot(*gradient)
     within = _within(steepness.shape)

@@ -1,1 +1,1 @@
-"""Blur as a measurement: estimators for integrative image sensors, and the cues that the pipeline takes from them."""
+"""Blur as a measurement: estimators of motion for integrative image sensors (papers 1 and 2)."""

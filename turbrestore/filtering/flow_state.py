@@ -28,7 +28,7 @@ import numpy as np
 
 from ..dynamics.flow_model import FlowDynamics, ProjectedFlow
 from .estimates import Gaussian
-from .kalman import predict, update_information_form
+from .kalman import predict, update
 
 # Smallest variance of the flow, so that noise-free synthetic data keep every gain defined: (0.001 px)².
 _FLOW_NOISE_FLOOR = 1e-6
@@ -53,7 +53,7 @@ def advance_flow_state(
 def update_flow_state(predicted: Gaussian, measured: ProjectedFlow, dynamics: FlowDynamics) -> tuple[Gaussian, float]:
     """Update the predicted state by a measured flow (17, 19); returns what :func:`advance_flow_state` does."""
     # Cᵀ(W^meas − W̄) = ξ + noise of covariance R I, by CᵀC = I.
-    state, _ = update_information_form(predicted, measured.state, np.eye(len(measured.state)), flow_noise(dynamics))
+    state = update(predicted, measured.state, np.eye(len(measured.state)), flow_noise(dynamics))
     # |W − W̄ − C ξ̂|² without the product C ξ̂.
     squared = measured.squared - float(predicted.mean @ (2 * measured.state - predicted.mean))
     return state, (max(squared, 0.0) / measured.size) ** 0.5

@@ -34,16 +34,16 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
+from ..core.robust import MEDIAN_DEVIATION, spread
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import known_shifts
 from ..registration.opencv_flow import DisParams, dis_solver
 from ..runtime.scratch import iter_frames
 from .placement import Placement, reduce_frames, relative_window
-from .survey import Survey, spread
+from .survey import Survey
 
 # Frames of which the median is taken, the fewest that tell objects from the background, and rows of it at a time.
 _SAMPLES, _FEWEST, _ROWS = 25, 9, 64
-_MEDIAN_DEVIATION = 1.4826
 # d counts from the first times the sum of v and the square of the second; windows of d and of v, pixels.
 _EXCEEDS, _LEAST_DEVIATION = 8.0, 0.01
 _WINDOW, _VARIANCE_WINDOW = 1.5, 3.0
@@ -275,7 +275,7 @@ def _median_model(
         values[hidden & ~few] = np.nan
         seen[rows] = np.isfinite(values).sum(axis=0) >= _FEWEST
         median[rows] = _median(values)
-        variance[rows] = (_MEDIAN_DEVIATION * _median(np.abs(values - median[rows]))) ** 2
+        variance[rows] = (MEDIAN_DEVIATION * _median(np.abs(values - median[rows]))) ** 2
     around = np.ones((2 * reach + 1,) * 2, np.uint8)
     least, known = np.float32(_LEAST_DEVIATION**2), cv2.erode(seen, around) > 0
     deviation = cv2.dilate(cv2.GaussianBlur(variance, (0, 0), _VARIANCE_WINDOW), around) + least

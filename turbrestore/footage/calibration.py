@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray
 from ..core.errors import DataError
 from ..core.remarks import counted
+from ..core.robust import robust_scale
 from ..io.output import size_text
 from ..io.pixels import PixelArray, planes_of, to_unit, with_planes
 from ..io.source import FrameSource
@@ -81,8 +82,8 @@ def make_calibration(clip: FrameSource, dark: FrameSource | None, flat: FrameSou
     offset = gain = None
     if dark is not None:
         offset = _dark_level(clip, dark)
-        spread = 1.4826 * np.median(np.abs(offset - np.median(offset)))
-        bad |= offset > np.median(offset) + max(_HOT_DEVIATIONS * float(spread), _HOT_LEAST)
+        usual = np.median(offset)
+        bad |= offset > usual + max(_HOT_DEVIATIONS * robust_scale(offset - usual), _HOT_LEAST)
         remarks.append(
             f"dark of {dark.name} ({counted(len(dark), 'frame')}, {_digest(offset)}) subtracted, "
             f"{counted(int(bad.sum()), 'hot pixel')}"

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..core.arrays import FloatArray, luminance
 from ..core.errors import DataError
+from ..core.robust import robust_scale
 from ..io.pixels import PixelArray, to_unit
 from ..io.source import FrameSource, numbers_text
 from .checks.missing_pixels import fill_holes
@@ -49,7 +50,7 @@ def find_object(frame: FloatArray) -> ObjectPlace | None:
     grey = luminance(frame)
     smooth = cv2.GaussianBlur(grey, (0, 0), _SMOOTHING)
     field = float(np.median(smooth))
-    noise = 1.4826 * float(np.median(np.abs(smooth - field)))
+    noise = robust_scale(smooth - field)
     top = float(smooth.max())
     if top - field < max(_LEAST_CONTRAST * noise, _LEAST_LEVELS):
         return None

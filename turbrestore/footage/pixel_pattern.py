@@ -28,30 +28,34 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..core.gradient import sobel_gradient
+from ..core.robust import robust_scale
+from ..core.thresholds import threshold
 from ..io.source import Window
 from .placement import relative_window
 from .survey import Moments, Survey
 
 
 @dataclass(frozen=True)
-class _Limits:
+class _Thresholds:
     """What tells a pattern of the sensor from the scene."""
 
-    frames: int = 8  # fewest frames, as for stripes of the sensor
-    motion: float = 0.3  # least s, pixels, as for stripes of the sensor
-    # Least deviation of fine detail of m in that of its noise.  Sixty clips without a pattern reach 1.7, patterns 11.
-    clear: float = 4.0
-    static: float = 0.25  # most that P adds to v, relative to what would move, as for stripes of the sensor
-    steep: float = 0.9  # quantile of the slopes from which s is measured
-    outlier: float = 5.0  # deviations of P beyond which a pixel is of an overlay; white noise reaches 4.5
-    high: float = 0.25  # cycles per pixel from which frequencies are high: half of the range
-    normal: float = 1.4826  # standard deviation of normal numbers in median absolute ones
-    window: int = 4  # frames before and after a cut that are compared
-    changed: float = 2.0  # least change of P at a cut, as a variance relative to what frames differ by elsewhere
-    pixels: int = 1 << 16  # about how many pixels are compared at cuts
+    frames: int = threshold(8, "frames", "theory: as for stripes of the sensor")
+    motion: float = threshold(0.3, "pixels", "theory: as for stripes of the sensor")  # least s
+    # Least deviation of fine detail of m in that of its noise.
+    clear: float = threshold(4.0, "1", "measured: sixty clips without a pattern reach 1.7, patterns 11")
+    # Most that P adds to v, relative to what would move.
+    static: float = threshold(0.25, "1", "theory: as for stripes of the sensor")
+    steep: float = threshold(0.9, "1", "chosen: quantile of the slopes from which s is measured")
+    # Deviations of P beyond which a pixel is of an overlay.
+    outlier: float = threshold(5.0, "1", "measured: white noise reaches 4.5 in a frame")
+    high: float = threshold(0.25, "cycles/pixel", "theory: half of the range of frequencies is high")
+    window: int = threshold(4, "frames", "chosen: frames before and after a cut that are compared")
+    # Least change of P at a cut, as a variance relative to what frames differ by elsewhere.
+    changed: float = threshold(2.0, "1", "chosen: no figure is known")
+    pixels: int = threshold(1 << 16, "pixels", "cost: as many, about, are compared at cuts")
 
 
-_LIMITS = _Limits()
+_LIMITS = _Thresholds()
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +186,7 @@ def _usual(fine: FloatArray) -> NDArray[np.bool_]:
 
 
 def _deviation(fine: FloatArray) -> float:
-    return _LIMITS.normal * float(np.median(np.abs(fine)))
+    return robust_scale(fine)
 
 
 def _squared_slope(image: FloatArray) -> FloatArray:

@@ -8,8 +8,8 @@ s : motion of the edges of the scene, pixels
 
 Stripes of the scene move with the air, so v exceeds n² by s² times the squared slope of c.  Those of the sensor stay,
 and do not raise v.  They are subtracted from every frame; a column that does not change while others do is filled from
-beside it.  Rows are the columns of the transposed frames.  A warm pixel exceeds its surroundings in m by itself, as no
-detail does that moves, and does not vary by its height times the motion.
+beside it.  Rows are the columns of the transposed frames.  A warm pixel stands out alone in m and does not flicker as
+moving detail of its height would.
 """
 
 from __future__ import annotations
@@ -23,31 +23,49 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..core.gradient import sobel_gradient
+from ..core.thresholds import threshold
 from ..io.source import Window
 from .placement import relative_window
 from .survey import Moments, Survey, measure_moments
 
-# Fewest frames from which stripes are found.
-_FEWEST = 8
-# Smoothing across the stripes, pixels.
-_ACROSS = 3.0
-# Least offset, in standard errors of the mean of the frames and in intensity, that is worth a correction.
-_CLEARLY, _LEAST = 4.0, 5e-4
-# Largest share, of the variance that stripes of the scene would have, of those of the sensor.
-_STATIC = 0.25
-# Gradient of the edges whose motion is measured, in deviations of the noise, and the least motion, pixels.
-_EDGE, _LEAST_MOTION = 8.0, 0.3
-# Parts along the stripes, and the least correlation of their offsets; offsets of a sensor, root mean square, are
-# smaller than those of strokes and bars.
-_PARTS, _ALIKE, _LARGEST = 3, 0.5, 0.04
-# Share of the height of a warm pixel over the median around by which it exceeds each neighbour; most that are warm.
-_ALONE, _MOST_WARM = 0.7, 0.005
-# Deviation of what is drawn over the noise, in units of it, and pixels around it in which no pixel is warm: strokes,
-# and a digit beside that changes.
-_DRAWN, _AROUND_DRAWN = 0.25, 12
-# A dead column varies less than this share of the noise and of the columns around; dead ones are few, and told
-# from others where there is noise of some size.
-_DEAD, _AROUND, _MOST_DEAD, _LEAST_NOISE = 0.3, 9, 0.05, 1 / 1020
+
+@dataclass(frozen=True)
+class _Thresholds:
+    """What tells stripes, warm pixels and dead columns of the sensor from the scene."""
+
+    frames: int = threshold(8, "frames", "chosen: half and double pass every test")  # fewest
+    # Smoothing across the stripes.
+    across: float = threshold(3.0, "pixels", "test: test_offsets_of_columns_and_rows_are_subtracted")
+    # Least offset, in standard errors of the mean of the frames and in intensity, that is worth a correction.
+    clearly: float = threshold(4.0, "1", "chosen: half and double pass every test")
+    least: float = threshold(5e-4, "intensity", "bits: an eighth of a level of 8 bits")
+    # Stripes of the sensor vary by less than this share of what moving stripes would.
+    static: float = threshold(0.25, "1", "test: test_stripes_of_the_scene_are_left")
+    # Gradient of the edges whose motion is measured, in deviations of the noise, and the least motion.
+    edge: float = threshold(8.0, "1", "test: test_stripes_of_the_scene_are_left")
+    motion: float = threshold(0.3, "pixels", "chosen: half and double pass every test")
+    # Parts along the stripes, and the least correlation of their offsets.
+    parts: int = threshold(3, "parts", "test: test_offsets_of_columns_and_rows_are_subtracted")
+    alike: float = threshold(0.5, "1", "test: test_offsets_of_columns_and_rows_are_subtracted")
+    # Largest root mean square of the offsets of a sensor; strokes and bars are larger.
+    largest: float = threshold(0.04, "intensity", "chosen: half and double pass every test")
+    # Share of the height of a warm pixel over the median around by which it exceeds each neighbour; most that are warm.
+    alone: float = threshold(0.7, "1", "test: test_warm_pixels_are_evened_out_and_points_of_the_scene_stay")
+    most_warm: float = threshold(0.005, "1", "chosen: half and double pass every test")
+    # Deviation of what is drawn over the noise, in units of it.
+    drawn: float = threshold(0.25, "1", "chosen: half and double pass every test")
+    # Pixels around it in which no pixel is warm: strokes, and a digit beside that changes.
+    around_drawn: int = threshold(
+        12, "pixels", "test: test_gaps_between_strokes_of_a_clock_that_ticks_are_no_warm_pixels"
+    )
+    # A dead column varies less than this share of the noise and of the columns around.
+    dead: float = threshold(0.3, "1", "chosen: half and double pass every test")
+    around: int = threshold(9, "pixels", "chosen: half and double pass every test")
+    most_dead: float = threshold(0.05, "1", "chosen: half and double pass every test")
+    noise: float = threshold(1 / 1020, "intensity", "bits: a quarter of a level of 8 bits; below, columns look dead")
+
+
+_LIMITS = _Thresholds()
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +93,12 @@ def without_stripes(survey: Survey, moments: Moments | None = None) -> tuple[Sur
 
     ``moments`` are those of the survey, if they are known.
     """
-    if len(survey.numbers) < _FEWEST:
+    if len(survey.numbers) < _LIMITS.frames:
         return survey, ()
     moments = moments or measure_moments(survey)
     mean, variance, usual = luminance(moments.mean), moments.change, max(moments.noise, 1e-4)
     motion = _motion(mean, variance, usual)
-    if motion < _LEAST_MOTION:
+    if motion < _LIMITS.motion:
         return survey, ()
     dead = (_dead(variance, usual), _dead(variance.T, usual))
     offsets = tuple(
@@ -107,20 +125,23 @@ def _motion(mean: FloatArray, variance: FloatArray, noise: float) -> float:
     """Root of the median squared motion of the edges of the scene, across themselves."""
     smooth = cv2.GaussianBlur(mean, (0, 0), 1.0)
     squares = (cv2.Scharr(smooth, cv2.CV_32F, 1, 0) / 32) ** 2 + (cv2.Scharr(smooth, cv2.CV_32F, 0, 1) / 32) ** 2
-    edges = squares > max((_EDGE * noise) ** 2 / 4, float(np.quantile(squares, 0.9)))
+    edges = squares > max((_LIMITS.edge * noise) ** 2 / 4, float(np.quantile(squares, 0.9)))
     if not edges.any():
         return 0.0
     return float(np.sqrt(np.median(np.maximum(variance[edges] - noise**2, 0) / squares[edges])))
 
 
 def _offsets(mean: FloatArray, variance: FloatArray, error: float, motion: float) -> FloatArray:
-    """Offset of every column, and of all or none, as they belong to the sensor or to the scene."""
-    fine = mean - cv2.GaussianBlur(mean, (0, 0), sigmaX=_ACROSS, sigmaY=1e-3)
+    """Column offsets; all zero if they belong to the scene."""
+    fine = mean - cv2.GaussianBlur(mean, (0, 0), sigmaX=_LIMITS.across, sigmaY=1e-3)
     offsets = np.median(fine, axis=0).astype(np.float32)
     size = float(np.sqrt(np.mean(np.median(np.abs(offsets)) ** 2)))
-    parts = [np.median(part, axis=0) for part in np.array_split(fine, _PARTS)]
-    clear = size >= max(_CLEARLY * 1.25 * error / np.sqrt(len(mean)), _LEAST) and offsets.std() <= _LARGEST
-    if not clear or np.corrcoef(parts).min() < _ALIKE:
+    parts = [np.median(part, axis=0) for part in np.array_split(fine, _LIMITS.parts)]
+    clear = (
+        size >= max(_LIMITS.clearly * 1.25 * error / np.sqrt(len(mean)), _LIMITS.least)
+        and offsets.std() <= _LIMITS.largest
+    )
+    if not clear or np.corrcoef(parts).min() < _LIMITS.alike:
         return np.zeros_like(offsets)
     slope = np.gradient(offsets) ** 2
     level = np.median(variance, axis=0)
@@ -128,16 +149,18 @@ def _offsets(mean: FloatArray, variance: FloatArray, error: float, motion: float
     steep, flat = slope >= np.quantile(slope, 0.75), slope <= np.quantile(slope, 0.25)
     gained = float(np.median(level[steep]) - np.median(level[flat]))
     expected = motion**2 * float(np.median(slope[steep]) - np.median(slope[flat]))
-    return offsets if gained < _STATIC * expected else np.zeros_like(offsets)
+    return offsets if gained < _LIMITS.static * expected else np.zeros_like(offsets)
 
 
 def _dead(variance: FloatArray, noise: float) -> NDArray[np.bool_]:
     """Mark the columns that have no noise while those around do."""
     level = np.sqrt(np.median(variance, axis=0)).astype(np.float32)
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(level, _AROUND, mode="reflect"), 2 * _AROUND + 1)
+    windows = np.lib.stride_tricks.sliding_window_view(
+        np.pad(level, _LIMITS.around, mode="reflect"), 2 * _LIMITS.around + 1
+    )
     around = np.median(windows, axis=1)
-    dead = level < _DEAD * np.minimum(around, noise if noise > _LEAST_NOISE else 0)
-    if dead.mean() > _MOST_DEAD:
+    dead = level < _LIMITS.dead * np.minimum(around, noise if noise > _LIMITS.noise else 0)
+    if dead.mean() > _LIMITS.most_dead:
         return np.zeros_like(dead)
     # Columns at the border are bars, or light that is clipped there.
     alive = np.flatnonzero(~dead)
@@ -147,18 +170,18 @@ def _dead(variance: FloatArray, noise: float) -> NDArray[np.bool_]:
 
 def _warm(mean: FloatArray, variance: FloatArray, noise: float, motion: float) -> NDArray[np.bool_]:
     """Mark static pixels that differ, each alone, from what is around them."""
-    height, least = _above_around(mean), max(_CLEARLY * noise, 2 * _LEAST)
+    height, least = _above_around(mean), max(_LIMITS.clearly * noise, 2 * _LIMITS.least)
     ring = np.ones((3, 3), np.uint8)
     ring[1, 1] = 0
     over = np.where(height > 0, mean - cv2.dilate(mean, ring), cv2.erode(mean, ring) - mean)
-    alone = (np.abs(height) > least) & (over > _ALONE * np.abs(height))
-    warm = alone & (variance - noise**2 < _STATIC * (motion * height) ** 2)
+    alone = (np.abs(height) > least) & (over > _LIMITS.alone * np.abs(height))
+    warm = alone & (variance - noise**2 < _LIMITS.static * (motion * height) ** 2)
     # Letters are drawn over the noise; a lone pixel among their strokes is one of them.
     smooth = cv2.medianBlur(mean, 3)
     slope = np.hypot(*sobel_gradient(smooth))
-    drawn = (variance < (_DRAWN * noise) ** 2) & (slope > _EDGE * noise)
-    warm &= cv2.dilate(drawn.astype(np.uint8), np.ones((2 * _AROUND_DRAWN + 1,) * 2, np.uint8)) == 0
-    return warm if warm.mean() <= _MOST_WARM else np.zeros_like(warm)
+    drawn = (variance < (_LIMITS.drawn * noise) ** 2) & (slope > _LIMITS.edge * noise)
+    warm &= cv2.dilate(drawn.astype(np.uint8), np.ones((2 * _LIMITS.around_drawn + 1,) * 2, np.uint8)) == 0
+    return warm if warm.mean() <= _LIMITS.most_warm else np.zeros_like(warm)
 
 
 def _above_around(image: FloatArray) -> FloatArray:

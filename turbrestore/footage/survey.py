@@ -17,6 +17,7 @@ import numpy as np
 
 from ..core.arrays import FloatArray, luminance
 from ..core.noise import estimate_noise
+from ..core.robust import spread
 from ..io.pixels import PixelArray
 from ..io.source import FrameSource, Window
 from ..runtime.scratch import drop_pages, iter_frames, new_stack
@@ -127,8 +128,3 @@ def reduced_shape(shape: tuple[int, ...], side: float, shortest: int) -> tuple[i
     """(T, h, w) or (T, h, w, 3) of frames that are reduced to a longest side, with no side below ``shortest``."""
     factor = max(1.0, max(shape[1:3]) / side)
     return (shape[0], *(max(shortest, round(length / factor)) for length in shape[1:3]), *shape[3:])
-
-
-def spread(count: int, most: int) -> list[int]:
-    """Places of at most ``most`` of ``count`` things, spread evenly."""
-    return [int(place) for place in np.linspace(0, count - 1, min(most, count)).round()]

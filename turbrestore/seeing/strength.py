@@ -7,10 +7,9 @@ V : variance of the displacement of blocks about their mean over the frame, squa
 D, r0, Cn² : aperture, Fried parameter, refractive-index structure constant.
 
 The displacement is measured twice, by flow (:mod:`turbrestore.seeing.displacement`) and by blur: the temporal mean is
-blurred by the displacement on top of what blurs a frame, and second moments add
-(:func:`turbrestore.blur_moments.cues.relative_blur`).  Where the two disagree by more than their errors, a remark says
-so.  The blur of more than two squared pixels is a lower bound, because the spectrum of the mean vanishes where a larger
-one would be read.
+blurred by the displacement on top of what blurs a frame, and second moments add (:mod:`.relative_blur`).  Where the two
+disagree by more than their errors, a remark says so.  The blur of more than two squared pixels is a lower bound,
+because the spectrum of the mean vanishes where a larger one would be read.
 
 Where the clip spans few correlation times, the variance over a long time is unknown: what the mean over time has taken
 away is put back only for lags within the clip.  The value is then a lower bound, and what follows from it too.
@@ -30,8 +29,6 @@ from typing import Any
 
 import numpy as np
 
-from ..blur_moments.cues import relative_blur
-from ..blur_moments.tile_spectra import CueParams
 from ..core.arrays import FloatArray
 from ..core.noise import estimate_noise
 from ..io.source import Window
@@ -39,6 +36,7 @@ from ..registration.centroid import Centroid
 from ..runtime.scratch import mean_of
 from ..synthesis.atmosphere import fried_parameter
 from .displacement import Displacement, Float64Array, MotionStatistics, measure_motion, motion_statistics
+from .relative_blur import relative_blur
 from .tilt_theory import MEAN_CONE, Optics, displacement_differences, strength_of_tilt
 
 # Relative error of a variance besides that of finitely many frames: on synthetic clips of D/r0 1 to 6 the variance of
@@ -47,8 +45,8 @@ _MODEL_ERROR = 0.12
 _BLUR_ERROR = 0.1
 # Blur by displacement above which it is a lower bound, squared pixels.
 LARGEST_BLUR = 2.0
-# Largest part of an image that is compared by blur, pixels a side, and the tiles of it.
-_COMPARED, _TILES = 512, CueParams(tile=64, departure=1.0)
+# Largest part of an image that is compared by blur, pixels a side.
+_COMPARED = 512
 # Share of rotation from which the displacement is not that of turbulence; without any relation of x and y it is 0.5.
 _ROTATING = 0.4
 _HALF, _E_FOLD = 0.5, float(np.exp(-1))
@@ -338,7 +336,7 @@ def _by_blur(mean: FloatArray, image: FloatArray, noise: float) -> Estimate | No
     height, width = image.shape[:2]
     rows, columns = (slice(max(side - _COMPARED, 0) // 2, None) for side in (height, width))
     one, other = (part[rows, columns][:_COMPARED, :_COMPARED] for part in (mean, image))
-    blur = relative_blur(one, other, max(noise, 1e-6), _TILES)
+    blur = relative_blur(one, other, max(noise, 1e-6))
     if not np.isfinite(blur.deviation):
         return None
     value = max(blur.variance, 0.0)

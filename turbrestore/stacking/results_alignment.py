@@ -20,6 +20,7 @@ import numpy as np
 
 from ..core.arrays import FloatArray, from_unit, luminance
 from ..core.errors import DataError
+from ..core.robust import spread
 from ..footage.frame_selection import frame_quality
 from ..registration.flow_algebra import compose_flows, invert_flow
 from ..registration.warp import warp
@@ -140,7 +141,7 @@ def _median(images: Sequence[FloatArray], found: Sequence[Alignment | str]) -> F
     """Median of the luminance of aligned images, on their mean geometry."""
     pairs = [(image, one.flow) for image, one in zip(images, found, strict=True) if isinstance(one, Alignment)]
     V = invert_flow(np.mean([flow for _, flow in pairs], axis=0, dtype=np.float32))
-    chosen = [pairs[place] for place in np.unique(np.linspace(0, len(pairs) - 1, _MEDIAN_OF).round().astype(int))]
+    chosen = [pairs[place] for place in spread(len(pairs), _MEDIAN_OF)]
     moved = [warp(luminance(image), compose_flows(flow, V)) for image, flow in chosen]
     median = np.median(moved, axis=0)
     return np.asarray(median, np.float32)

@@ -1,1 +1,1 @@
-"""How far a restored image is to be believed, pixel by pixel."""
+"""Standard deviation of every pixel of a restored image."""

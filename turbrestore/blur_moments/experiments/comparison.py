@@ -150,7 +150,7 @@ def follow(contestant: Contestant, recording: Recording, of_state: bool) -> Trac
     else:
         exposed = slice(motion.timing.exposure_steps)
         errors = np.sqrt(((estimates - recording.outputs)[..., exposed] ** 2).mean(-1))
-    observed = int(results[0][1].observed.flat[0])
+    observed = results[0][1].observed
     misfits = np.array([innovation.normalised_squared for _, innovation in results]) / observed
     return Track(errors, misfits, observed, estimates[:, 0])
 

@@ -27,9 +27,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ...core.errors import ConfigurationError, DataError, require
 from ...filtering.estimates import Gaussian
-from ...filtering.kalman import Innovation, update_information_form
+from ...filtering.kalman import apply, update
 from ..moments import BlurModel
 from ..sensor import Float64Array
+from .innovation import Innovation
 
 NORMS = ("map", "two", "infinity")
 _POWERS = {"map": (2,), "two": (2,), "infinity": (2, 8, 32)}
@@ -71,7 +72,11 @@ class ImageFilter:
         found, batch = x.reshape(state.mean.shape), state.mean.shape[:-1]
         prior = state if problem.has_prior else Gaussian(found, state.cov / _WEAK)
         linear, H = linear.reshape(*batch, -1), H.reshape(*batch, *H.shape[1:])
-        after, innovation = update_information_form(prior, linear, H, 1.0)
+        after = update(prior, linear, H, 1.0)
+        missed = linear - apply(H, prior.mean)
+        # rᵀ(I + H P Hᵀ)⁻¹r, which is never below zero but by rounding.
+        squared = (missed * (linear - apply(H, after.mean))).sum(-1)
+        innovation = Innovation(np.maximum(squared, 0.0), linear.shape[-1])
         return (after if problem.has_prior else Gaussian(found, after.cov)), innovation
 
 

@@ -31,10 +31,11 @@ from scipy.linalg import solve_discrete_are
 
 from ...core.errors import ConfigurationError, DataError, require
 from ...filtering.estimates import Gaussian
-from ...filtering.kalman import Innovation, predict, update_covariance_form
+from ...filtering.kalman import predict
 from ..moments import BASES, BlurModel, image_moments, moment_noise, predicted_moments
 from ..sensor import Float64Array
 from .image_observer import ImageFilter
+from .innovation import Innovation, correct
 from .lifting import LiftedSystem
 
 METHODS = ("extended", "unscented")
@@ -58,7 +59,7 @@ class FixedGain:
         expected, H, R = predicted_moments(model, state.mean, model.check_inputs(state, inputs), (1,))
         measured = image_moments(frame, model.sensor.pixels, 1, total=model.sensor.total)[..., 1:]
         # The covariance of the innovation is that of the Kalman update; only the gain differs.
-        _, innovation = update_covariance_form(state, measured, H, R, expected)
+        _, innovation = correct(state, measured - expected, H, R)
         F = np.eye(order) - self.gain[:, None] * H
         cov = F @ state.cov @ np.swapaxes(F, -1, -2) + np.outer(self.gain, self.gain) * R
         mean = state.mean + (measured - expected) * self.gain
@@ -86,11 +87,11 @@ class MomentFilter:
         """Correct the predicted state by its frame."""
         values, pixels, total = model.check_inputs(state, inputs), model.sensor.pixels, model.sensor.total
         if self.method == "unscented":
-            expected, H, R = _regressed_moments(model, state, values, self.orders, self.basis)
+            expected, H, R = regressed_moments(model, state, values, self.orders, self.basis)
         else:
             expected, H, R = predicted_moments(model, state.mean, values, self.orders, self.basis)
         measured = image_moments(frame, pixels, max(self.orders), self.basis, total)[..., list(self.orders)]
-        return update_covariance_form(state, measured, H, R, expected)
+        return correct(state, measured - expected, H, R)
 
 
 Observer = FixedGain | MomentFilter | ImageFilter
@@ -138,7 +139,7 @@ def steady_kalman(model: BlurModel) -> tuple[FixedGain, Float64Array]:
     return FixedGain(gain), np.asarray(cov, np.float64)
 
 
-def _regressed_moments(
+def regressed_moments(
     model: BlurModel, state: Gaussian, inputs: Float64Array, orders: tuple[int, ...], basis: str
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Moments, H and R by regression of the moments on sigma points; R includes the residual of the regression."""

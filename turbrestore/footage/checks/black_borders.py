@@ -7,6 +7,7 @@ would bend a border into the scene, and fusion would darken the result.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -14,21 +15,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray
+from ...core.thresholds import threshold
 from ...io.pixels import PixelArray
 
-# Highest 8-bit level that counts as black, because codecs add noise; size, in pixels, from which brighter spots are not
-# noise; and width, in pixels, of the rim that codecs and interpolation darken.
-_BLACK_OF_CODEC, _SPOT, _DARKENED = 4, 3, 3
-# A border is at least so many pixels wide, and moves by as many; it occurs, and is absent, in this share and number of
-# the frames.
-_NARROWEST, _AT_TIMES, _FEWEST = 3, 0.02, 2
-# It takes this share of a side in such a frame, and at times, on so many sides.
-_OF_SIDE, _SIDES = 0.5, 3
-# Its edge is the line through this quantile of the widths in either outer third.  If a larger share of the widths is so
-# many pixels short of the line, it is an arc.
-_NARROW, _OFF_LINE, _BEFORE = 0.25, 2.0, 0.15
-# Least share of the borders that have a straight edge.
-_STRAIGHT = 0.5
+
+@dataclass(frozen=True)
+class _Thresholds:
+    """What tells a black border that moves from a dark scene."""
+
+    black_of_codec: int = threshold(4, "8-bit levels", "test: test_black_of_a_codec")  # codecs add noise to black
+    spot: int = threshold(3, "pixels", "test: test_black_of_a_codec")  # smaller bright spots are noise
+    # Width of the rim that codecs and interpolation darken.
+    darkened: int = threshold(3, "pixels", "test: test_borders_show_the_mean_of_other_frames")
+    # Least width of a border, and least change of it.
+    narrowest: int = threshold(3, "pixels", "test: test_a_sky_of_noise_around_zero, and test_a_bar_does_not_grow")
+    # Frames in which it occurs, and in which it does not: a share and a number.
+    at_times: float = threshold(0.02, "1", "chosen: half and double pass every test")
+    fewest: int = threshold(2, "frames", "test: test_one_frame_that_was_moved")
+    # Share of a side that it takes in such a frame, and at times, and the number of such sides.
+    of_side: float = threshold(0.5, "1", "test: test_a_black_part_of_the_scene_beside_a_border")
+    sides: int = threshold(3, "sides", "test: test_a_bright_board_and_a_star_on_black")
+    # Its edge is the line through this quantile of the widths in either outer third, as a dark scene widens it.
+    narrow: float = threshold(0.25, "1", "test: test_a_black_part_of_the_scene_beside_a_border")
+    # It is an arc if a larger share of the widths is further before the line.
+    off_line: float = threshold(2.0, "pixels", "test: test_a_planet_that_the_wind_shakes")
+    before: float = threshold(0.15, "1", "chosen: half and double pass every test")
+    straight: float = threshold(0.5, "1", "test: test_a_planet_that_the_wind_shakes")  # least share of borders
+
+
+_LIMITS = _Thresholds()
 
 
 class BlackBorderDetector:
@@ -49,9 +64,9 @@ class BlackBorderDetector:
         self._black = self._black or [np.zeros((2, side.shape[1]), np.int64) for side in sides]
         for number, (side, place) in enumerate(zip(sides, _sides(marked), strict=True)):
             edge = _mark(side, place, black)
-            strip = _level(side[:_NARROWEST])
+            strip = _level(side[: _LIMITS.narrowest])
             dark = strip.max(axis=0) <= black
-            if dark.mean() >= _OF_SIDE:
+            if dark.mean() >= _LIMITS.of_side:
                 if edge is None and _level(side).max() <= black:
                     continue
                 self._borders[number] += 1
@@ -65,12 +80,12 @@ class BlackBorderDetector:
 
     def found(self) -> bool:
         """Tell whether the frames have black borders that move."""
-        if not self._frames or np.max(self._most - self._least) < _NARROWEST:
+        if not self._frames or np.max(self._most - self._least) < _LIMITS.narrowest:
             return False
-        fewest = max(_AT_TIMES * self._frames, _FEWEST)
-        changing = np.array([np.mean((counts >= fewest).all(axis=0)) >= _OF_SIDE for counts in self._black])
-        bordered = (self._borders >= fewest) & (self._straight >= _STRAIGHT * self._borders)
-        return int(np.sum(changing & bordered)) >= _SIDES
+        fewest = max(_LIMITS.at_times * self._frames, _LIMITS.fewest)
+        changing = np.array([np.mean((counts >= fewest).all(axis=0)) >= _LIMITS.of_side for counts in self._black])
+        bordered = (self._borders >= fewest) & (self._straight >= _LIMITS.straight * self._borders)
+        return int(np.sum(changing & bordered)) >= _LIMITS.sides
 
 
 def black_border(pixels: PixelArray) -> NDArray[np.bool_]:
@@ -96,10 +111,10 @@ def _mark(side: PixelArray, place: NDArray[np.bool_], black: int) -> NDArray[np.
     if not dark.any():
         return None
     shown = (_level(side[: -(-len(side) // 2)]) > black).astype(np.uint8)
-    edge = _edge(cv2.morphologyEx(shown, cv2.MORPH_OPEN, np.ones((_SPOT, _SPOT), np.uint8)) > 0)
+    edge = _edge(cv2.morphologyEx(shown, cv2.MORPH_OPEN, np.ones((_LIMITS.spot, _LIMITS.spot), np.uint8)) > 0)
     if edge is not None:
-        near = cv2.dilate(dark.astype(np.uint8), np.ones((1, 2 * _DARKENED + 1), np.uint8)) > 0
-        place[near & (np.arange(len(place))[:, None] < edge + _DARKENED)] = True
+        near = cv2.dilate(dark.astype(np.uint8), np.ones((1, 2 * _LIMITS.darkened + 1), np.uint8)) > 0
+        place[near & (np.arange(len(place))[:, None] < edge + _LIMITS.darkened)] = True
     return edge
 
 
@@ -114,12 +129,12 @@ def _edge(shown: NDArray[np.bool_]) -> NDArray[np.float64] | None:
     widths = shown.argmax(axis=0)[places]
     third = -(-len(places) // 3)
     left, right = (
-        start + int(np.argsort(widths[start : start + third], kind="stable")[int(_NARROW * third)])
+        start + int(np.argsort(widths[start : start + third], kind="stable")[int(_LIMITS.narrow * third)])
         for start in (0, len(places) - third)
     )
     slope = (widths[right] - widths[left]) / max(places[right] - places[left], 1)
     edge = np.asarray(widths[left] + slope * (np.arange(shown.shape[1]) - places[left]), np.float64)
-    return edge if np.mean(edge[places] - widths > _OFF_LINE) <= _BEFORE else None
+    return edge if np.mean(edge[places] - widths > _LIMITS.off_line) <= _LIMITS.before else None
 
 
 def _sides(pixels: NDArray[Any]) -> tuple[NDArray[Any], ...]:
@@ -134,4 +149,4 @@ def _level(pixels: PixelArray) -> PixelArray:
 
 
 def _black(pixels: PixelArray) -> int:
-    return _BLACK_OF_CODEC if pixels.dtype == np.uint8 else 0
+    return _LIMITS.black_of_codec if pixels.dtype == np.uint8 else 0

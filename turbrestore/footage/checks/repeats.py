@@ -13,22 +13,36 @@ nearly all differ little, nothing moves, and no frame is taken for a repeat.
 from __future__ import annotations
 
 from array import array
+from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray, luminance
 from ...core.noise import estimate_noise
+from ...core.thresholds import threshold
 
-# Pixels of a frame that are compared, about, and the share of them that counts as edges.
-_PIXELS, _EDGES = 1 << 15, 0.1
-_PERCENTILE, _DEVIATIONS = 80, 1.2816
-# Largest d of a repeat: in units of σ, relative to the contrast of the frame, and relative to the usual d.
-_OF_NOISE, _OF_CONTRAST, _OF_USUAL = 0.7, 0.03, 1 / 3
-# Shortest side of frames that are compared; fewer pixels are alike by chance.
-_SMALLEST = 16
-# Least share of frames that are no repeats.
-_LEAST_LIVE = 0.1
+
+@dataclass(frozen=True)
+class _Thresholds:
+    """What tells a frame that is recorded again from one of a scene that hardly moves."""
+
+    pixels: int = threshold(1 << 15, "pixels", "cost: as many, about, are compared while a frame is read")
+    edges: float = threshold(0.1, "1", "test: test_air_that_calms_down_gives_no_repeats")  # share that counts as edges
+    percentile: int = threshold(80, "%", "test: test_a_picture_that_stops_is_found_in_h264")
+    # Largest d of a repeat: in units of σ, relative to the contrast of the frame, and relative to the usual d.
+    of_noise: float = threshold(0.7, "1", "theory: a repeat differs by less than σ, other frames by √2 σ")
+    of_contrast: float = threshold(0.03, "1", "test: test_air_that_calms_down_gives_no_repeats")
+    of_usual: float = threshold(1 / 3, "1", "chosen: half and double pass every test")
+    # Shortest side of frames that are compared; fewer pixels are alike by chance.
+    smallest: int = threshold(16, "pixels", "chosen: half and double pass every test")
+    live: float = threshold(0.1, "1", "test: test_without_air_no_frame_repeats_another")  # least share of no repeats
+
+
+_LIMITS = _Thresholds()
+# Deviations of normal numbers within which that percentile of them is.
+_PERCENTILE_DEVIATIONS = NormalDist().inv_cdf((1 + _LIMITS.percentile / 100) / 2)
 
 
 class RepeatDetector:
@@ -41,28 +55,28 @@ class RepeatDetector:
 
     def update(self, values: FloatArray) -> None:
         """Take the next frame, intensities of shape (H, W) or (H, W, 3)."""
-        step = max(1, min(values.size // _PIXELS, len(values) // _SMALLEST))
+        step = max(1, min(values.size // _LIMITS.pixels, len(values) // _LIMITS.smallest))
         noise = estimate_noise(values)
         grey = luminance(np.ascontiguousarray(values[::step]))
         before, self._previous = self._previous, grey
         self._differences.append(np.inf if before is None else _difference(grey, before))
-        self._bounds.append(max(_OF_NOISE * noise, _OF_CONTRAST * float(grey.std())))
+        self._bounds.append(max(_LIMITS.of_noise * noise, _LIMITS.of_contrast * float(grey.std())))
 
     def found(self) -> NDArray[np.bool_]:
         """Tell which frames repeat the one before."""
         differences = np.frombuffer(self._differences)
         close = differences < np.frombuffer(self._bounds)
         live = differences[~close & np.isfinite(differences)]
-        if len(live) < max(1.0, _LEAST_LIVE * len(differences)):
+        if len(live) < max(1.0, _LIMITS.live * len(differences)):
             return np.zeros(len(differences), bool)
-        return np.asarray(close & (differences < _OF_USUAL * float(np.median(live))))
+        return np.asarray(close & (differences < _LIMITS.of_usual * float(np.median(live))))
 
 
 def _difference(grey: FloatArray, before: FloatArray) -> float:
     """Deviation of the difference where rows of the frame before are steepest."""
-    if min(grey.shape) < _SMALLEST:
+    if min(grey.shape) < _LIMITS.smallest:
         return np.inf
     slope = np.abs(before[:, 2:] - before[:, :-2])
-    steep = slope >= np.quantile(slope, 1 - _EDGES)
+    steep = slope >= np.quantile(slope, 1 - _LIMITS.edges)
     change = np.abs(grey - before)[:, 1:-1][steep]
-    return float(np.percentile(change, _PERCENTILE)) / _DEVIATIONS
+    return float(np.percentile(change, _LIMITS.percentile)) / _PERCENTILE_DEVIATIONS

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray, luminance
 from ...core.decision import Decision
+from ...core.robust import bisquare_weights, robust_scale
 from ...io.source import Window
 from ...registration.camera.global_shift import DEAD_ZONE, ShiftReference, measure_shift, prepare_shift_reference
 from ..survey import Survey
@@ -287,8 +288,5 @@ def _affine_fit(values: FloatArray, truth: FloatArray, known: NDArray[np.bool_])
 
 def _reweighted(difference: NDArray[np.float64], known: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:
     """Tukey's weights of residuals, and their mean square under these weights."""
-    size = np.abs(difference[known])
-    scale = 1.4826 * float(np.median(size)) if size.size else 0.0
-    reach = np.clip(1 - (difference / max(4.685 * scale, 1e-9)) ** 2, 0, 1)
-    weights = known * reach**2
+    weights = known * bisquare_weights(difference, robust_scale(difference[known]), 1e-9)
     return weights, float((weights * difference**2).sum() / max(float(weights.sum()), 1e-12))

@@ -22,22 +22,35 @@ from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray
 from ...core.decision import Decision
+from ...core.robust import bisquare_weights, robust_scale
+from ...core.thresholds import threshold
 from ...io.source import Window
 from ...registration.camera.global_shift import known_shifts
 
-# Deviation of the Gaussian average: as a share of the longer side of a frame, and in those of the blur of the frames.
-_REACH, _REACH_BLURS = 0.045, 2.0
-# Fewest frames of which a median says anything.
-_FEWEST = 8
-# Least deviation over time of the logarithm of g that is corrected, its percentile over the frame, and the share of the
-# squared residual that g has to explain.
-# Behind moving air, with walkers, snow, rain or noise, g explains up to six tenths of it.
-_LEAST_CHANGE, _MOST_OF, _EXPLAINED = 0.03, 90, 0.8
-# Largest shift of a static camera, pixels of the reduced frames, root mean square.
-_STATIC = 1.0
-# Gains are limited to this factor; what is added to r, as a share of its bright parts: dark ones count less.
-_LARGEST, _DARK, _BRIGHT = 3.0, 0.03, 95
-_ROUNDS = 3
+
+@dataclass(frozen=True)
+class _Thresholds:
+    """What tells light that changes in place from motion, and how smooth it is."""
+
+    # Deviation of the Gaussian average: as a share of the longer side of a frame, and in those of its blur.
+    reach: float = threshold(0.045, "1", "chosen: half and double pass every test")
+    reach_blurs: float = threshold(2.0, "1", "test: test_air_walkers_and_moving_cameras_are_no_light")
+    frames: int = threshold(8, "frames", "chosen: half and double pass every test")
+    # Least deviation over time of the logarithm of g, at the percentile over the frame.
+    change: float = threshold(0.03, "1", "chosen: half and double pass every test")
+    percentile: int = threshold(90, "%", "chosen: half of it passes every test")
+    # Least share of the squared residual that g explains.
+    explained: float = threshold(0.8, "1", "measured: air, walkers, snow, rain and noise reach 0.6")
+    # Root mean square of the shifts, in reduced frames, up to which the camera is static.
+    static: float = threshold(1.0, "pixels", "chosen: half and double pass every test")
+    largest: float = threshold(3.0, "1", "chosen: half and double pass every test")
+    # What is added to r: this share of its bright parts, at the percentile, so that dark ones count less.
+    dark: float = threshold(0.03, "1", "chosen: half and double pass every test")
+    bright: int = threshold(95, "%", "chosen: half of it passes every test")
+    rounds: int = threshold(3, "fits", "test: test_air_walkers_and_moving_cameras_are_no_light")
+
+
+_LIMITS = _Thresholds()
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,22 +81,22 @@ def measure_shade(
 
     ``frames`` (T, h, w), reduced, and blurred by ``blur`` pixels.
     """
-    if len(frames) < _FEWEST or float(np.ptp(frames[0])) <= 0:
+    if len(frames) < _LIMITS.frames or float(np.ptp(frames[0])) <= 0:
         return None, ()
     reference = np.median(frames, axis=0).astype(np.float32)
-    dark = np.float32(_DARK * np.percentile(reference, _BRIGHT))
-    reach = max(_REACH * max(reference.shape), _REACH_BLURS * blur)
+    dark = np.float32(_LIMITS.dark * np.percentile(reference, _LIMITS.bright))
+    reach = max(_LIMITS.reach * max(reference.shape), _LIMITS.reach_blurs * blur)
     fields, explained = np.empty_like(frames), np.zeros(2)
     for field, frame in zip(fields, frames, strict=True):
         field[...], residuals = _field(frame + dark, reference + dark, reach)
         explained += residuals
     logarithms = np.log(fields)
     logarithms -= logarithms.mean(axis=0)
-    change = float(np.percentile(logarithms.std(axis=0), _MOST_OF))
-    if change < _LEAST_CHANGE or explained[1] > (1 - _EXPLAINED) * explained[0]:
+    change = float(np.percentile(logarithms.std(axis=0), _LIMITS.percentile))
+    if change < _LIMITS.change or explained[1] > (1 - _LIMITS.explained) * explained[0]:
         return None, ()
     shifts = known_shifts(frames / max(float(frames.std()), 1e-6))[0]
-    if float(np.square(shifts - shifts.mean(axis=0)).sum(axis=1).mean()) > _STATIC**2:
+    if float(np.square(shifts - shifts.mean(axis=0)).sum(axis=1).mean()) > _LIMITS.static**2:
         return None, ()
     gains = np.exp(logarithms).astype(np.float16)
     low, high = (float(value) for value in np.percentile(gains, (1, 99)))
@@ -95,13 +108,12 @@ def measure_shade(
 def _field(f: FloatArray, r: FloatArray, reach: float) -> tuple[FloatArray, NDArray[np.float64]]:
     """Return g of a frame, and the robust squared residuals of the reference without and with it."""
     weights, field = np.ones_like(f), np.ones_like(f)
-    for _ in range(_ROUNDS):
+    for _ in range(_LIMITS.rounds):
         over, under = (cv2.GaussianBlur(weights * r * part, (0, 0), reach) for part in (f, r))
         known = under > 1e-9
         field = np.where(known, over / np.where(known, under, 1), 1).astype(np.float32)
-        field = np.clip(field, 1 / _LARGEST, _LARGEST)
+        field = np.clip(field, 1 / _LIMITS.largest, _LIMITS.largest)
         residual = f - field * r
-        scale = 1.4826 * float(np.median(np.abs(residual)))
-        weights = (np.clip(1 - (residual / max(4.685 * scale, 1e-6)) ** 2, 0, 1) ** 2).astype(np.float32) + 1e-3
+        weights = bisquare_weights(residual, robust_scale(residual), 1e-6).astype(np.float32) + 1e-3
     squares = [float((weights * part**2).sum()) for part in (f - r, residual)]
     return field, np.array(squares)

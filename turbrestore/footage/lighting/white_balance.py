@@ -12,32 +12,44 @@ the colours of the mean stay.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray, luminance
 from ...core.decision import Decision
+from ...core.robust import bisquare_weights, robust_scale
+from ...core.thresholds import threshold
 from ...registration.camera.global_shift import known_shifts
 from ..placement import reduce_frames
 from ..survey import Survey
 
-# Longest side of the reduced frames, pixels, and their blur.
-_SIDE, _BLUR = 64, 1.5
-# Deviation over time, of the logarithm of a ratio, from which the white balance hunts.  It is below 0.004 in real clips
-# of still scenes, and 0.006 in one of skiers that the camera follows.
-_LEAST_CHANGE = 0.01
-_DARK, _SATURATED = 0.02, 0.98
-_ROUNDS = 4
+
+@dataclass(frozen=True)
+class _Thresholds:
+    """What tells a white balance that hunts, and which pixels show it."""
+
+    side: int = threshold(64, "pixels", "cost: a longest side that takes no time beside the reading of a frame")
+    blur: float = threshold(1.5, "pixels", "chosen: half and double pass every test")  # of the reduced frames
+    # Deviation over time, of the logarithm of a ratio.
+    change: float = threshold(0.01, "1", "measured: below 0.004 for still scenes, 0.006 in a clip of skiers")
+    dark: float = threshold(0.02, "intensity", "chosen: half and double pass every test")
+    saturated: float = threshold(0.98, "intensity", "bits: codecs and interpolation bring white to within 5 of 255")
+    rounds: int = threshold(4, "fits", "chosen: half and double pass every test")
+
+
+_LIMITS = _Thresholds()
 
 
 def steady_white_balance(survey: Survey) -> tuple[Survey, tuple[Decision, ...]]:
     """Take a white balance that changes out of the frames; others, and grey frames, are returned as they are."""
     if survey.small.ndim != 4 or len(survey.small) < 3:
         return survey, ()
-    ratios = _ratios(reduce_frames(survey.small, survey.small.shape, _SIDE, 1, _BLUR))
+    ratios = _ratios(reduce_frames(survey.small, survey.small.shape, _LIMITS.side, 1, _LIMITS.blur))
     changes = ratios.std(axis=0)
-    if changes.max() < _LEAST_CHANGE:
+    if changes.max() < _LIMITS.change:
         return survey, ()
     factors = np.exp(ratios).astype(np.float32)
     balance = dict(zip(survey.clip.numbers, factors, strict=True))
@@ -68,7 +80,7 @@ def _ratios(frames: FloatArray) -> NDArray[np.float64]:
             for plane, (dx, dy) in zip(planes, shifts, strict=True)
         ]
     )
-    usable = (placed > _DARK) & (placed < _SATURATED)
+    usable = (placed > _LIMITS.dark) & (placed < _LIMITS.saturated)
     count = usable.sum(axis=0)
     reference = np.where(usable, placed, 0).sum(axis=0) / np.maximum(count, 1)
     usable &= count > len(frames) / 2
@@ -84,10 +96,10 @@ def _gain(values: FloatArray, reference: NDArray[np.float64], usable: NDArray[np
     f, r = values[usable].astype(np.float64), reference[usable]
     if f.size < 16:
         return 1.0
-    weights, gain = np.ones(f.size), 1.0
-    for _ in range(_ROUNDS):
+    weights: NDArray[np.floating] = np.ones(f.size)
+    gain = 1.0
+    for _ in range(_LIMITS.rounds):
         gain = float((weights * r * f).sum() / max(float((weights * r * r).sum()), 1e-12))
         residual = f - gain * r
-        scale = 1.4826 * float(np.median(np.abs(residual)))
-        weights = np.clip(1 - (residual / max(4.685 * scale, 1e-9)) ** 2, 0, 1) ** 2
+        weights = bisquare_weights(residual, robust_scale(residual), 1e-9)
     return max(gain, 1e-3)

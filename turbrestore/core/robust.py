@@ -1,0 +1,26 @@
+"""Statistics that a few outliers do not change, and an even choice of some of many things."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Standard deviation of normal numbers in their median absolute one: 1 / Φ⁻¹(3/4).
+MEDIAN_DEVIATION = 1.4826
+# Tukey's constant, in standard deviations: fits by these weights keep 95 % of the efficiency of least squares.
+_TUKEY = 4.685
+
+
+def robust_scale(residuals: NDArray[np.floating]) -> float:
+    """Return the standard deviation of residuals about zero, by their median absolute value; 0 for none."""
+    return MEDIAN_DEVIATION * float(np.median(np.abs(residuals))) if residuals.size else 0.0
+
+
+def bisquare_weights(residuals: NDArray[np.floating], scale: float, least: float) -> NDArray[np.floating]:
+    """Return Tukey's weights, from 1 for no residual to 0 beyond 4.685 of their ``scale``, or beyond ``least``."""
+    return np.clip(1 - (residuals / max(_TUKEY * scale, least)) ** 2, 0, 1) ** 2
+
+
+def spread(count: int, most: int) -> list[int]:
+    """Return the places of at most ``most`` of ``count`` things, spread evenly."""
+    return [int(place) for place in np.linspace(0, count - 1, min(most, count)).round()]
