@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import skimage.data
+from flow_systems import uneven_flows
 from hypothesis import HealthCheck, given, settings
 from hypothesis.strategies import none
 
@@ -132,6 +133,16 @@ def blurred(
     """The scene under a Gaussian of one σ, or of one along x and one along y, with noise."""
     soft = cv2.GaussianBlur(scene, (0, 0), sigmaX=np.atleast_1d(sigma)[0], sigmaY=np.atleast_1d(sigma)[-1])
     return (soft + rng.normal(0, noise, scene.shape)).astype(np.float32)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(7)
+
+
+@pytest.fixture
+def noise_flows() -> np.ndarray:
+    return uneven_flows()
 
 
 @pytest.fixture(scope="session")

@@ -2,30 +2,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from flow_systems import (
-    flows_from,
-    orthonormal,
-    rotating_flows,
-    rotation,
-    run_system,
-    uneven_flows,
-)
+from flow_systems import flows_from, orthonormal, rotating_flows, rotation, run_system
 
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.dynamics import dynamic_texture as module
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify, identify_memory, modes_memory
 from turbrestore.dynamics.flow_model import flow_of, predict_flow, project_deviation
 from turbrestore.dynamics.simulate import simulate
-
-
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(7)
-
-
-@pytest.fixture
-def noise_flows() -> np.ndarray:
-    return uneven_flows()
 
 
 def test_system_is_the_least_squares_fit_of_the_paper(noise_flows):

@@ -6,10 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flow_systems import (
-    rotating_flows,
-    uneven_flows,
-)
+from flow_systems import rotating_flows
 
 from turbrestore.core.errors import DataError
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
@@ -25,16 +22,6 @@ from turbrestore.dynamics.simulate import simulate, stable_system
 from turbrestore.runtime.scratch import drop_pages, new_stack
 
 STATM = Path("/proc/self/statm")
-
-
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(7)
-
-
-@pytest.fixture
-def noise_flows() -> np.ndarray:
-    return uneven_flows()
 
 
 def test_full_rank_reconstructs_the_flows(noise_flows):

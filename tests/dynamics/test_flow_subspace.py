@@ -2,25 +2,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from flow_systems import (
-    assert_same_dynamics,
-    flows_from,
-    orthonormal,
-    uneven_flows,
-)
+from flow_systems import assert_same_dynamics, flows_from, orthonormal
 
 from turbrestore.dynamics import dynamic_texture
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, FlowStrips, identify
-
-
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(7)
-
-
-@pytest.fixture
-def noise_flows() -> np.ndarray:
-    return uneven_flows()
 
 
 def test_gram_route_equals_singular_value_decomposition(noise_flows):

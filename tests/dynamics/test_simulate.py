@@ -4,14 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from flow_systems import (
-    flows_from,
-    orthonormal,
-    rotating_flows,
-    rotation,
-    run_system,
-    uneven_flows,
-)
+from flow_systems import flows_from, orthonormal, rotating_flows, rotation, run_system
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_lyapunov
@@ -20,16 +13,6 @@ from turbrestore.core.errors import ConfigurationError
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
 from turbrestore.dynamics.flow_model import flow_of
 from turbrestore.dynamics.simulate import simulate, stable_system
-
-
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(7)
-
-
-@pytest.fixture
-def noise_flows() -> np.ndarray:
-    return uneven_flows()
 
 
 def unstable_dynamics(seed: int, n: int, radius: float):
