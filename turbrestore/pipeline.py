@@ -63,6 +63,8 @@ from .wording import (
 
 # Every border pixel of a cropped image is visible in at least this share of the training frames.
 _SEEN = 0.9
+# A pixel that fewer frames show is about as noisy as in one of them.
+_FEW_FRAMES = 4
 # Least variance of the noise of dark parts, relative to that of bright ones, that the decision states.
 _LEAST_SHARE = 0.01
 # Least standard deviation of ln V, the displacement that D/r0 implies: theory and simulated clips agree no better.
@@ -229,7 +231,8 @@ def _check_by_frames(
     new, lasting = halves.alternate.noise().deviation ** 2, halves.lasting.noise().deviation ** 2
     structure = compare_structure(image, training, flows, len(training) * new, max(lasting - new, 0.0))
     run.decide(*explain_structure(structure))
-    if not structure.explained:
+    fused = replace(fused, structure=structure, is_mean=not structure.explained)
+    if fused.is_mean:
         return replace(fused, image=fused.mean), _Evidence(saturation, is_mean=True)
     # No guard overrides a width that was asked for.
     if not run.params.finds_blur:
@@ -276,6 +279,7 @@ def _deblur_and_crop(run: Run, fused: Restoration, evidence: _Evidence, psf: NDA
         uncertainty=None if deviation is None else deviation[part],
         disagreement=None if agreed is None else agreed.share[part],
         noise=None if evidence.witnesses is None else evidence.witnesses.noise,
+        unseen=_unseen_share(run, seen, part, fused.train),
     )
     if deblurred is None:
         return restoration
@@ -409,6 +413,14 @@ def _find_crop(
     sigma = 0.0 if deblurred is None else deblurred.deconvolution.sigma
     crop = well_seen(seen, _SEEN, int(np.ceil(sigma)), MIN_SIDE)
     return crop, explain_border(float(seen.min()), None if crop == whole else crop)
+
+
+def _unseen_share(run: Run, seen: FloatArray, part: tuple[slice, slice], train: int) -> float:
+    """Share of the image that fewer than four of the training frames, or than half of a few, show."""
+    unseen = seen * train < min(_FEW_FRAMES, train / 2)
+    if run.prepared.hidden is not None:
+        unseen |= run.prepared.hidden
+    return float(unseen[part].mean())
 
 
 def _check_sigma(sigma: float | None, shape: tuple[int, ...]) -> None:
