@@ -46,7 +46,6 @@ def test_every_doubt_is_named_once_with_a_remedy(restoration):
     done, reading, removed = restoration.deconvolution, restoration.guard_readings[-1], restoration.deconvolution.sigma
     none, frames = replace(done, sigma=0.0), restoration.frame_count
     coarse = (np.indices((112, 112)) // 2).sum(axis=0) % 2
-    loud = replace(restoration.noise, power=restoration.noise.power + 0.3)
     doubts = {
         CheckKind.INPUT: {"decisions": (Decision("input", "", "cut short", CheckKind.INPUT),)},
         CheckKind.SATURATED: {"decisions": (Decision("saturation", "", "3% are white", CheckKind.SATURATED),)},
@@ -64,7 +63,6 @@ def test_every_doubt_is_named_once_with_a_remedy(restoration):
         CheckKind.BLUR_UNCERTAIN: {"posterior": widths(restoration, 0.4 * removed, removed, 1.2 * removed)},
         CheckKind.BLUR_UNKNOWN: {"blur": replace(restoration.blur, uncertainty=math.inf)},
         CheckKind.TOO_SHARP: {"guard_readings": (replace(reading, passed=False),)},
-        CheckKind.UNSTEADY: {"noise": loud},
     }  # fmt: skip
     assert doubts.keys() == set(CheckKind) - {CheckKind.DRIFT}
     for kind, change in doubts.items():

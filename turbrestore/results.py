@@ -38,9 +38,8 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-# Blur that pixels and interpolation have by themselves, error of the geometry that is seen, pixels, and noise that is:
-# two grey levels of 8 bits.
-_SEEN_BLUR, _SEEN_BEND, _SEEN_NOISE = 0.5, 1.0, 2 / 255
+# Blur that pixels and interpolation have by themselves, and error of the geometry that is seen, pixels.
+_SEEN_BLUR, _SEEN_BEND = 0.5, 1.0
 # Frames whose halves are too few to tell what they agree on.
 _FEW = 8
 # Share of the image that is worth a look; most of something.
@@ -260,9 +259,6 @@ def _checks(restoration: Restoration, motion: float) -> Iterator[Check]:
     if (disputed := _disputed(restoration)) > _HALF:
         yield write_check(CheckKind.AGREEMENT, disputed)
     yield from _checks_of_blur(restoration)
-    noise, of_frame = restoration.noise, math.sqrt(filtered.image_noise)
-    if noise is not None and noise.deviation > max(of_frame, _SEEN_NOISE):
-        yield write_check(CheckKind.UNSTEADY, noise.deviation / of_frame)
 
 
 def _checks_of_blur(restoration: Restoration) -> Iterator[Check]:

@@ -79,10 +79,6 @@ _CHECKS = {
         "at the width of {0:.2f} pixels that was given, edges ring or overshoot, or noise is amplified",
         "leave out --sigma, so that the width is measured",
     ),
-    CheckKind.UNSTEADY: (
-        "what the frames differ by does not average out: it is {0:.1f} times as strong in the image as in a frame",
-        "--frames FIRST:END with the frames during which the scene stays the same",
-    ),
     CheckKind.DRIFT: (
         "{0} of the image is averaged less, because the result drifted from the input",
         "ignore this where something moves slowly",

@@ -25,7 +25,6 @@ class CheckKind(StrEnum):
     GEOMETRY = "geometry"
     MOTION = "motion"  # that the frames do not agree on
     AGREEMENT = "agreement"  # on detail
-    UNSTEADY = "unsteady"  # what the frames differ by does not average out
     UNSEEN = "unseen"
     NO_BLUR_REMOVED = "no blur removed"
     BLUR_LEFT = "blur left"
