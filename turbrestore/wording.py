@@ -69,7 +69,7 @@ _CHECKS = {
     ),
     CheckKind.BLUR_UNCERTAIN: (
         "{0:.2f} pixels of blur are removed, but {1:.2f} to {2:.2f} are possible",
-        "--sigma {2:.2f} and --sigma {1:.2f} show whether more or less is better",
+        "--sigma {2:.2f} shows whether more is better",
     ),
     CheckKind.BLUR_UNKNOWN: (
         "the width of the blur could not be measured, and none is removed",
