@@ -13,6 +13,7 @@ from turbrestore.core.arrays import FloatArray
 from turbrestore.footage.checks.content import clean_source, keep_all
 from turbrestore.io.output import check_output
 from turbrestore.io.video import open_frames, write_video
+from turbrestore.report import SteadyFigures
 from turbrestore.report.film import Film, film_length, write_film
 from turbrestore.steady.settings import SteadyParams
 from turbrestore_cli.inputs import files_read, open_checked
@@ -104,14 +105,15 @@ def steady_order(order: SteadyOrder, job: Job[object], film_path: Path) -> Stead
     order.check()
     source, report = open_checked(order.path, order.selection)
     source = clean_source(source, keep_all(report))
-    machine, fps = Machine(), source.fps or USUAL_RATE
-    images = _images(source, order.params, machine, job)
+    machine, fps, figures = Machine(), source.fps or USUAL_RATE, SteadyFigures()
+    images = _images(source, order.params, machine, job, figures)
     encoding = order.written.encoding()
     write_video(order.output, images, fps, source.bit_depth, order.overwrite, encoding, companion=source)
     write_settings(order.settings, settings_record(machine, order.selection, order.params, order.written))
     count = film_length(len(source), *source.shape[1:3])
     film_path.unlink(missing_ok=True)
     film = write_film(film_path, _pairs(source, order.output, count, job), count, fps, _RATE_FACTOR)
+    job.message = f"Verdict: {figures.verdict}."
     return Steadied(order.output, film, film_path)
 
 
@@ -132,11 +134,14 @@ def watch_camera(name: str, job: Job[None]) -> None:
         job.show("steadied", steadied.image)
 
 
-def _images(source: FrameSource, params: SteadyParams, machine: Machine, job: Job[object]) -> Iterator[FloatArray]:
+def _images(
+    source: FrameSource, params: SteadyParams, machine: Machine, job: Job[object], figures: SteadyFigures
+) -> Iterator[FloatArray]:
     from turbrestore.steady.video import steady_frames
 
     for number, frame in enumerate(steady_frames(source, params, machine.runtime()), 1):
         job.progress("steady", number, len(source))
+        figures.note(frame)
         yield frame.image
 
 

@@ -50,6 +50,8 @@ class Tab:
         What the user has chosen of the deconvolution; None leaves it to be measured.
     border : {"keep", "crop"}
         What the user has chosen of the border.
+    ordered : Order or None
+        What was ordered last of the clip, as the form says it.
     steadied : Steadied or None
         The newest steadied video of the clip.
     rows : list of Row
@@ -64,6 +66,7 @@ class Tab:
         self.clip: Clip | None = None
         self.job: Job[object] | None = None
         self.restored: Restored | None = None
+        self.ordered: Order | None = None
         self.tuned: DeconvolutionParams | None = None
         self.border: Literal["keep", "crop"] = "keep"
         self.steadied: Steadied | None = None
@@ -90,7 +93,7 @@ class Tab:
         try:
             clip = open_clip(path, Path(path.name) if uploaded else self.folders.shown(path))
             self.stop()
-            self.clip, self.job, self.restored = clip, None, None
+            self.clip, self.job, self.restored, self.ordered = clip, None, None, None
             self.tuned, self.border, self.steadied = None, "keep", None
         finally:
             self._opening -= 1
@@ -129,7 +132,7 @@ class Tab:
 
     def run(self, order: Order) -> Job[Restored]:
         """Restore in a thread; the result becomes that of the tab when it is done."""
-        earlier = self.restored
+        earlier, self.ordered = self.restored, order
 
         def work(job: Job[Restored]) -> Restored:
             restored = restore_order(order, job, earlier)
@@ -142,6 +145,7 @@ class Tab:
     def preview(self, order: Order) -> Job[Restored]:
         """Restore a small part in a thread."""
         assert self.clip is not None
+        self.ordered = order
         part = preview_order(order, self.clip.source.shape)
         return self._start("restore", lambda job: restore_order(part, job))
 

@@ -62,6 +62,7 @@ TABLES = {
     "registration": Table("registration.py"),
     "steady": Table("steady.py reported"),
     "stacking": Table("stacking.py"),
+    "verdicts": Table("verdicts.py"),
     "flow_calls": Table("flow_calls.py", timed=True),
     "presets": Table("flow_calls.py --presets", timed=True),
     "speed": Table("speed.py", timed=True),

@@ -168,6 +168,7 @@ def work(order: Order) -> ClipRow:
         restoration, source = restore_clip(dataclasses.replace(order, overwrite=True, quiet=True))
         x, y, width, height = restoration.crop
         checks = restoration.verdict.checks
+        known = {check.text for check in checks}
         middle = len(source) // 2
         return dataclasses.replace(
             row,
@@ -177,8 +178,8 @@ def work(order: Order) -> ClipRow:
             height=height,
             blur=0.0 if restoration.deconvolution is None else float(restoration.deconvolution.sigma),
             seconds=float(sum(restoration.seconds.values())),
-            checks="; ".join(checks),
-            remarks="; ".join(remark for remark in source.warnings if remark not in checks),
+            checks="; ".join(map(str, checks)),
+            remarks="; ".join(remark for remark in source.warnings if remark not in known),
             before=thumbnail_uri(source.read(middle, middle + 1)[0][y : y + height, x : x + width]),
             after=thumbnail_uri(restoration.image),
         )

@@ -16,7 +16,6 @@ from cyclopts import Parameter
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import ConfigurationError, require
-from turbrestore.core.remarks import counted
 from turbrestore.footage.checks.content import clean_source, keep_all
 from turbrestore.io.containers.encoding import BY_SUFFIX, Encoding, write_pipe
 from turbrestore.io.containers.stream import open_camera, open_pipe, read_raw, write_raw
@@ -38,8 +37,6 @@ from .signals import until_interrupted
 
 # Frames per second of inputs that do not say.
 USUAL_RATE = 25.0
-# Share of the image from which it is worth saying that the long average drifted.
-_ASTRAY = 0.02
 _MOST_BITS = {"h264": 8, "hevc": 10, ".gif": 8, ".webp": 8}
 
 
@@ -279,7 +276,6 @@ class _Facts:
     def __init__(self, verbose: bool) -> None:
         self.verbose = verbose
         self.figures = SteadyFigures()
-        self.let_go: list[float] = []
 
     def watch(
         self, frames: Iterable[SteadyFrame], total: int, progress: Callable[[str, int, int], None] | None
@@ -289,11 +285,7 @@ class _Facts:
             if self.verbose and (frame.starts_scene or frame.sigma != self.figures.sigma):
                 what = "a scene begins; " if frame.starts_scene else ""
                 say(f"frame {frame.number}: {what}{frame.sigma:.2f} pixels of blur are removed", quiet=False)
-            self.figures.scenes += frame.starts_scene
-            self.figures.sigma = frame.sigma
-            self.figures.displacement.append(frame.displacement)
-            self.figures.moving.append(float(frame.moving.mean()))
-            self.let_go.append(frame.let_go)
+            self.figures.note(frame)
             if progress is not None:
                 progress("steady", len(self.figures.moving), total)
             yield frame
@@ -307,25 +299,13 @@ class _Facts:
             "sigma": self.figures.sigma,
             "mean_displacement": float(np.mean(self.figures.displacement)),
             "moving_share": float(np.mean(self.figures.moving)),
-            "let_go_share": float(np.mean(self.let_go)),
+            "let_go_share": float(np.mean(self.figures.let_go)),
+            "verdict": dataclasses.asdict(self.figures.verdict),
         }
 
     def text(self) -> str:
         """One line for a person."""
-        found = self.figures
-        count, moved = counted(len(found.moving), "frame"), float(np.mean(found.displacement))
-        blur = f" and {found.sigma:.2f} pixels of blur" if found.sigma > 0 else ""
-        return (
-            f"{count} in {found.seconds:.1f} s, with {moved:.2f} pixels of motion{blur} removed; "
-            f"{100 * np.mean(found.moving):.0f} % of the image moves{self._astray()}"
-        )
-
-    def _astray(self) -> str:
-        """Say where less is averaged, so that the output keeps to the input."""
-        share = float(np.mean(self.let_go))
-        if share < _ASTRAY:
-            return ""
-        return f"; {100 * share:.0f} % of the image is averaged less, because the result drifted from the input"
+        return f"{self.figures.seconds:.1f} s: {self.figures.verdict}"
 
 
 def _images(frames: Iterable[SteadyFrame], masks: BinaryIO | None) -> Iterator[FloatArray]:

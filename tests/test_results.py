@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
+from turbrestore.blind.structure import StructureReading
 from turbrestore.core.decision import Decision
+from turbrestore.core.verdict import CheckKind
 from turbrestore.pipeline import restore
-from turbrestore.seeing.strength import Estimate
 from turbrestore.settings import RestoreParams
 
 
@@ -36,34 +37,67 @@ def test_the_motion_of_the_verdict_is_that_of_the_flows(restoration):
     assert restoration.motion == pytest.approx(expected, rel=0.05)
 
 
-def test_every_doubt_is_named(restoration):
-    done, reading = restoration.deconvolution, restoration.guard_readings[-1]
-    seeing = restoration.seeing
-    missed = replace(seeing, displacement_by_flow=Estimate(0.2, 0.1, 0.3), displacement_by_blur=Estimate(1.5, 1.2, 1.8))
+def widths(restoration, low, width, high):
+    """The posterior with other quantiles of the width."""
+    return replace(restoration.posterior, width=np.array([low, width, high]))
+
+
+def test_every_doubt_is_named_once_with_a_remedy(restoration):
+    done, reading, removed = restoration.deconvolution, restoration.guard_readings[-1], restoration.deconvolution.sigma
+    none, frames = replace(done, sigma=0.0), restoration.frame_count
+    coarse = (np.indices((112, 112)) // 2).sum(axis=0) % 2
     doubts = {
-        "no sharper than the mean": {"image": restoration.mean},
-        "hardly move (0.00 pixels)": {"centroid": replace(restoration.centroid, flows=0 * restoration.centroid.flows)},
-        "centroid has not converged": {"centroid": replace(restoration.centroid, converged=False)},
-        "deconvolution has not converged": {"deconvolution": replace(done, converged=False)},
-        "at the width that was given": {"guard_readings": (replace(reading, passed=False),)},
-        "no blur is removed, because": {
-            "guard_readings": (replace(reading, passed=False),),
-            "deconvolution": replace(done, sigma=0.0),
-        },
-        "could not be measured": {"blur": replace(restoration.blur, uncertainty=math.inf)},
-        "motion that the flow has missed": {"seeing": missed},
-        "as noisy as the average of 1.0 frames": {"filtered": replace(restoration.filtered, shares=np.eye(24)[0])},
-        "100% of the pixels are saturated or seen in no frame": {"uncertainty": restoration.uncertainty + np.inf},
-        "cut short": {"decisions": (Decision("input", "", "cut short"),)},
-        "the flow model is overfitted": {"dynamics": replace(restoration.dynamics, overfitted=True)},
-        "3% are at full scale": {"decisions": (Decision("saturation", "", "3% are at full scale"),)},
-        "may have left traces": {"decisions": (Decision("moving objects", "", ""),)},
-        "the frames contradict the filtered image": {"decisions": (Decision("structure", "", ""),)},
+        CheckKind.INPUT: {"decisions": (Decision("input", "", "cut short", CheckKind.INPUT),)},
+        CheckKind.SATURATED: {"decisions": (Decision("saturation", "", "3% are white", CheckKind.SATURATED),)},
+        CheckKind.LARGE_MOTION: {"decisions": (Decision("motion", "", "9 pixels", CheckKind.LARGE_MOTION),)},
+        CheckKind.SCENE_CHANGES: {"is_mean": True, "structure": StructureReading(0.0, 0.6, 0.4)},
+        CheckKind.CONTRADICTION: {"is_mean": True, "structure": StructureReading(0.3, 0.6, 0.0)},
+        CheckKind.MOTION: {"structure": StructureReading(0.0, 0.6, 0.0)},
+        CheckKind.REPETITION: {"mean": coarse.astype(np.float32)},
+        CheckKind.FEW_FRAMES: {"frame_count": 7},
+        CheckKind.GEOMETRY: {"dynamics": replace(restoration.dynamics, R=1600.0)},
+        CheckKind.AGREEMENT: {"disagreement": np.ones_like(restoration.disagreement)},
+        CheckKind.UNSEEN: {"unseen": 0.04},
+        CheckKind.NO_BLUR_REMOVED: {"deconvolution": none, "posterior": widths(restoration, 0.6, 0.9, 1.2)},
+        CheckKind.BLUR_LEFT: {"posterior": widths(restoration, 1.5 * removed, 2.5 * removed, 3 * removed)},
+        CheckKind.BLUR_UNCERTAIN: {"posterior": widths(restoration, 0.4 * removed, removed, 1.2 * removed)},
+        CheckKind.BLUR_UNKNOWN: {"blur": replace(restoration.blur, uncertainty=math.inf)},
+        CheckKind.TOO_SHARP: {"guard_readings": (replace(reading, passed=False),)},
     }  # fmt: skip
-    for words, change in doubts.items():
+    assert doubts.keys() == set(CheckKind) - {CheckKind.DRIFT}
+    for kind, change in doubts.items():
         verdict = replace(restoration, **change).verdict
-        assert any(words in check for check in verdict.checks), (words, verdict)
-        assert "; check: " in str(verdict)
+        assert [check.kind for check in verdict.checks] == [kind], verdict
+        (check,) = verdict.checks
+        assert check.text and check.remedy and "{" not in check.text + check.remedy
+        assert str(verdict).endswith(f"; check: {check.text} ({check.remedy})")
+    assert f"{frames} frames" in restoration.verdict.gained
+
+
+def test_a_remedy_names_the_width_that_was_measured(restoration):
+    changed = replace(
+        restoration,
+        deconvolution=replace(restoration.deconvolution, sigma=0.0),
+        posterior=widths(restoration, 0.61, 0.93, 1.2),
+    )
+    (check,) = changed.verdict.checks
+    assert check.text == "no blur is removed, although 0.93 pixels were measured (0.61 to 1.20)"
+    assert check.remedy.startswith("--sigma 0.93 ")
+
+
+def test_a_shift_of_the_whole_frame_is_no_doubt_about_the_geometry(restoration):
+    shifts = 40 * np.random.default_rng(0).standard_normal((len(restoration.centroid.flows), 1, 1, 2))
+    shaken = (restoration.centroid.flows + shifts).astype(np.float32)
+    dynamics = replace(restoration.dynamics, R=1600.0)
+    moved = replace(restoration, centroid=replace(restoration.centroid, flows=shaken), dynamics=dynamics)
+    assert moved.verdict.checks == ()
+    bent = replace(restoration, dynamics=dynamics)
+    assert [check.kind for check in bent.verdict.checks] == [CheckKind.GEOMETRY]
+
+
+def test_objects_that_were_replaced_are_part_of_what_was_gained(restoration):
+    verdict = replace(restoration, objects_replaced=True).verdict
+    assert verdict.gained.endswith("removed, moving objects replaced by the background") and not verdict.checks
 
 
 def test_an_earlier_stage_has_a_verdict_too(sequence):

@@ -59,7 +59,8 @@ def evidence_of_frames(
     new, lasting = halves.alternate.noise().deviation ** 2, halves.lasting.noise().deviation ** 2
     structure = compare_structure(image, training, flows, len(training) * new, max(lasting - new, 0.0))
     run.decide(*explain_structure(structure))
-    if not structure.explained:
+    fused = replace(fused, structure=structure, is_mean=not structure.explained)
+    if fused.is_mean:
         return replace(fused, image=fused.mean), Evidence(saturation, is_mean=True)
     # No guard overrides a width that was asked for.
     if not run.params.finds_blur:

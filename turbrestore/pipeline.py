@@ -53,6 +53,8 @@ from .wording import (
 
 # Every border pixel of a cropped image is visible in at least this share of the training frames.
 _SEEN = 0.9
+# A pixel that fewer frames show is about as noisy as in one of them.
+_FEW_FRAMES = 4
 
 
 def restore(
@@ -220,6 +222,7 @@ def _deblur_and_crop(run: Run, fused: Restoration, evidence: Evidence, psf: NDAr
         uncertainty=None if deviation is None else deviation[part],
         disagreement=None if agreed is None else agreed.share[part],
         noise=None if evidence.witnesses is None else evidence.witnesses.noise,
+        unseen=_unseen_share(run, seen, part, fused.train),
     )
     if deblurred is None:
         return restoration
@@ -295,6 +298,14 @@ def _find_crop(
     sigma = 0.0 if deblurred is None else deblurred.deconvolution.sigma
     crop = well_seen(seen, _SEEN, int(np.ceil(sigma)), MIN_SIDE)
     return crop, explain_border(float(seen.min()), None if crop == whole else crop)
+
+
+def _unseen_share(run: Run, seen: FloatArray, part: tuple[slice, slice], train: int) -> float:
+    """Share of the image that fewer than four of the training frames, or than half of a few, show."""
+    unseen = seen * train < min(_FEW_FRAMES, train / 2)
+    if run.prepared.hidden is not None:
+        unseen |= run.prepared.hidden
+    return float(unseen[part].mean())
 
 
 def _check_sigma(sigma: float | None, shape: tuple[int, ...]) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from .core.decision import Decision
 from .core.remarks import Doubt
+from .core.verdict import CheckKind
 from .footage.background import without_moving_objects
 from .footage.bars import Bars, without_bars
 from .footage.levels import Levels, stretch_levels
@@ -35,6 +36,7 @@ class Prepared:
     hidden: NDArray[np.bool_] | None
     title: Title | None  # overlay that is put back into results
     decisions: tuple[Decision, ...]
+    objects_replaced: bool = False
 
     @property
     def picture(self) -> Window:
@@ -64,7 +66,11 @@ def prepare(source: FrameSource, static_mask: str = "auto", scratch: Path | None
     survey, levels, range_decisions = stretch_levels(survey)
     clip, object_decisions = without_moving_objects(survey) if static_mask != "off" else (survey.clip, ())
     decisions = (
-        *(Decision("input", "to be checked", found) for found in source.warnings if isinstance(found, Doubt)),
+        *(
+            Decision("input", "to be checked", found, CheckKind.INPUT)
+            for found in source.warnings
+            if isinstance(found, Doubt)
+        ),
         *bar_decisions,
         *stripe_decisions,
         *pattern_decisions,
@@ -74,11 +80,12 @@ def prepare(source: FrameSource, static_mask: str = "auto", scratch: Path | None
         *range_decisions,
         *object_decisions,
     )
-    return Prepared(clip, levels, bars, hidden, title, decisions)
+    return Prepared(clip, levels, bars, hidden, title, decisions, bool(object_decisions))
 
 
 def undo_preparation(restoration: Restoration, prepared: Prepared) -> Restoration:
     """Bring a restoration of prepared frames back to the levels of the clip, and put title and bars back."""
+    restoration = replace(restoration, objects_replaced=prepared.objects_replaced)
     if prepared.levels.changed:
         restoration = _at_levels_of_clip(restoration, prepared.levels)
     for part in (prepared.title, prepared.bars):
@@ -87,7 +94,7 @@ def undo_preparation(restoration: Restoration, prepared: Prepared) -> Restoratio
 
 
 def _at_levels_of_clip(restoration: Restoration, levels: Levels) -> Restoration:
-    finer, uncertainty = restoration.finer, restoration.uncertainty
+    finer, uncertainty, noise = restoration.finer, restoration.uncertainty, restoration.noise
     return replace(
         restoration,
         image=np.clip(levels.original(restoration.image), 0, 1),
@@ -96,6 +103,7 @@ def _at_levels_of_clip(restoration: Restoration, levels: Levels) -> Restoration:
         filtered=at_levels_of_clip(restoration.filtered, levels),
         deconvolution=at_levels_of_clip(restoration.deconvolution, levels),
         blur=at_levels_of_clip(restoration.blur, levels),
+        noise=None if noise is None else noise.scaled(1 / levels.gain**2),
         uncertainty=None if uncertainty is None else uncertainty / np.float32(levels.gain),
         finer=None if finer is None else np.clip(levels.original(finer), 0, 1),
     )

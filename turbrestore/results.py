@@ -9,17 +9,21 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
+from .agreement.repetition import repetition
 from .blind.guards import GuardReading
+from .blind.structure import StructureReading
 from .blur.estimation import BlurEstimate
 from .blur.posterior import BlurPosterior
-from .core.arrays import FloatArray
+from .core.arrays import FloatArray, luminance
 from .core.decision import Decision
+from .core.gradient import sobel_gradient
 from .core.noise_spectrum import NoiseSpectrum
 from .core.remarks import counted
+from .core.verdict import Check, CheckKind, Verdict
 from .deconvolution.deconvolve import Deconvolution
 from .display.maps import plot_images
 from .display.preview import preview
-from .dynamics.flow_model import FlowDynamics
+from .dynamics.flow_model import FlowDynamics, mean_flow_error
 from .filtering.alternating import FilterCheckpoint, Filtered
 from .footage.levels import Levels
 from .metrics import sharpness
@@ -27,20 +31,23 @@ from .registration.centroid import Centroid
 from .registration.coverage import Rectangle
 from .runtime.scratch import variance_of
 from .seeing.strength import Seeing
+from .wording import share_words, write_check
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Result = TypeVar("Result")
 
-# Frames that move less have little to undo, pixels; an image that gains less is no sharper than the mean.
-_STILL, _NO_GAIN = 0.05, 1.02
-# An image of fewer frames, if all had equal weight, is about as noisy as one of them.
-_FEW_FRAMES = 4
-# Share of pixels without information that is worth a look.
-_UNKNOWN = 0.01
-# Decisions that are a doubt about the image, whatever they choose.
-_DOUBTS = ("input", "motion", "saturation")
+# Blur that pixels and interpolation have by themselves, and error of the geometry that is seen, pixels.
+_SEEN_BLUR, _SEEN_BEND = 0.5, 1.0
+# Frames whose halves are too few to tell what they agree on.
+_FEW = 8
+# Share of the image that is worth a look; most of something.
+_UNSEEN, _HALF = 0.01, 0.5
+# Factor by which a width may be off; ``benchmarks/verdicts.py`` lists what more costs.
+_OFF = 1.5
+# Largest displacement, in standard deviations along an axis.
+_LARGEST = 3.0
 
 
 class Store(Protocol):
@@ -63,30 +70,6 @@ class Store(Protocol):
 
     def checkpoint(self, state: FilterCheckpoint) -> None:
         """Take the newest state of the filter."""
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What a restoration gained, and what a person should look at.
-
-    Attributes
-    ----------
-    gained : str
-        One sentence without a full stop.
-    checks : tuple of str
-        One clause each; empty where nothing is doubtful.
-
-    Examples
-    --------
-    >>> str(Verdict("1.50 times as sharp as the mean of 48 frames", ()))
-    '1.50 times as sharp as the mean of 48 frames; looks right'
-    """
-
-    gained: str
-    checks: tuple[str, ...]
-
-    def __str__(self) -> str:
-        return f"{self.gained}; " + (f"check: {'; '.join(self.checks)}" if self.checks else "looks right")
 
 
 @dataclass(frozen=True, repr=False)
@@ -134,7 +117,15 @@ class Restoration:
         Share, 0 to 1, of the mean of the registered frames in the image: where they do not agree on its detail or
         colour, and in flat parts that ring or are noisy; None unless the image was deblurred.
     noise : NoiseSpectrum or None
-        Noise of the filtered image at every frequency, in the levels of the stages; None unless a blur is looked for.
+        Noise of the filtered image at every frequency; None unless a blur is looked for.
+    structure : StructureReading or None
+        How far the registered frames agree with the filtered image.
+    is_mean : bool
+        Whether the mean of the frames is the result, because they contradict the filtered image.
+    objects_replaced : bool
+        Whether moving objects were replaced by the background.
+    unseen : float
+        Share of the image that hardly any frame shows.
     """
 
     image: FloatArray
@@ -156,6 +147,10 @@ class Restoration:
     finer: FloatArray | None = None
     disagreement: FloatArray | None = None
     noise: NoiseSpectrum | None = None
+    structure: StructureReading | None = None
+    is_mean: bool = False
+    objects_replaced: bool = False
+    unseen: float = 0.0
 
     @property
     def motion(self) -> float:
@@ -170,15 +165,10 @@ class Restoration:
         return sharpness(self.image, mean) if np.ptp(mean) > 0 else math.nan
 
     @property
-    def is_mean(self) -> bool:
-        """Whether the mean of the frames is the result, because they contradict the filtered image."""
-        return any(decision.subject == "structure" for decision in self.decisions)
-
-    @property
     def verdict(self) -> Verdict:
         """What was gained, and what to look at; computed from the images at every call."""
-        motion, gain = self.motion, self.sharpening
-        return Verdict(_gained(self, motion, gain), tuple(_checks(self, motion, gain)))
+        motion = self.motion
+        return Verdict(_gained(self, motion), tuple(_checks(self, motion)))
 
     def plot(self) -> Figure:
         """Draw the temporal mean beside the result.
@@ -230,53 +220,84 @@ def at_levels_of_clip(result: Result, levels: Levels) -> Result:
     return result
 
 
-def _gained(restoration: Restoration, motion: float, gain: float) -> str:
-    count = counted(restoration.frame_count, "frame")
+def _gained(restoration: Restoration, motion: float) -> str:
+    count, gain = counted(restoration.frame_count, "frame"), restoration.sharpening
     if restoration.is_mean:
         return f"the mean of {count} is the result"
     removed = [f"{motion:.2f} pixels of motion"]
     if restoration.deconvolution is not None and restoration.deconvolution.sigma > 0:
         removed.append(f"{restoration.deconvolution.sigma:.2f} pixels of blur")
     sharper = "" if math.isnan(gain) else f"{gain:.2f} times as sharp as the mean of "
-    return f"{sharper}{count}, with {' and '.join(removed)} removed"
+    objects = ", moving objects replaced by the background" if restoration.objects_replaced else ""
+    return f"{sharper}{count}, with {' and '.join(removed)} removed{objects}"
 
 
-def _checks(restoration: Restoration, motion: float, gain: float) -> Iterator[str]:
+def _checks(restoration: Restoration, motion: float) -> Iterator[Check]:
+    for decision in restoration.decisions:
+        if decision.check is not None:
+            yield write_check(decision.check, decision.reason)
+    structure, filtered = restoration.structure, restoration.filtered
     if restoration.is_mean:
-        yield "the frames contradict the filtered image; the scene itself may move"
-    elif motion < _STILL:
-        yield f"the frames hardly move ({motion:.2f} pixels), so there was little to undo"
-    elif gain < _NO_GAIN:
-        yield "the image is no sharper than the mean of the frames"
-    if not restoration.centroid.converged:
-        yield "the centroid has not converged"
-    yield from (decision.reason for decision in restoration.decisions if decision.subject in _DOUBTS)
-    if restoration.dynamics is not None and restoration.dynamics.overfitted:
-        yield "the flow model is overfitted: too few flows for so many states"
-    if any(decision.subject == "moving objects" for decision in restoration.decisions):
-        yield "moving objects were replaced by the background and may have left traces"
-    if restoration.seeing is not None and (doubt := restoration.seeing.disagreement):
-        yield doubt
-    if restoration.filtered is not None and not restoration.is_mean:
-        effective = 1 / float(np.square(restoration.filtered.shares).sum())
-        if effective < _FEW_FRAMES:
-            yield f"the image is as noisy as the average of {effective:.1f} frames"
+        changes = structure is not None and structure.changes
+        yield write_check(CheckKind.SCENE_CHANGES if changes else CheckKind.CONTRADICTION)
+    if restoration.unseen > _UNSEEN:
+        yield write_check(CheckKind.UNSEEN, share_words(restoration.unseen))
+    if restoration.is_mean or filtered is None or restoration.dynamics is None:
+        return
+    # A shift of the whole frame bends no line, and no copy is nearer for it.
+    of_air = _share_of_air(restoration.centroid.flows)
+    period, largest = repetition(restoration.mean), _LARGEST * of_air * motion / math.sqrt(2)
+    if period < 2 * largest:
+        yield write_check(CheckKind.REPETITION, period, largest)
+    error = of_air * mean_flow_error(restoration.dynamics, int(np.isfinite(filtered.sharpness).sum()))
+    if restoration.frame_count < _FEW:
+        yield write_check(CheckKind.FEW_FRAMES, counted(restoration.frame_count, "frame"))
+    elif error > _SEEN_BEND:
+        yield write_check(CheckKind.GEOMETRY, error, counted(restoration.frame_count, "frame"))
+    if structure is not None and structure.left > _HALF:
+        yield write_check(CheckKind.MOTION, structure.left)
+    if (disputed := _disputed(restoration)) > _HALF:
+        yield write_check(CheckKind.AGREEMENT, disputed)
     yield from _checks_of_blur(restoration)
-    deviation = restoration.uncertainty
-    if deviation is not None and not restoration.is_mean and (unknown := np.isinf(deviation).mean()) > _UNKNOWN:
-        yield f"{unknown:.0%} of the pixels are saturated or seen in no frame"
 
 
-def _checks_of_blur(restoration: Restoration) -> Iterator[str]:
-    done, readings = restoration.deconvolution, restoration.guard_readings
+def _checks_of_blur(restoration: Restoration) -> Iterator[Check]:
+    done, readings, removed = restoration.deconvolution, restoration.guard_readings, _removed(restoration)
     if done is None:
         return
-    if readings and not readings[-1].passed:
-        if done.sigma > 0:
-            yield "at the width that was given, edges ring or overshoot, or noise is amplified"
-        else:
-            yield "no blur is removed, because every width made edges ring or overshoot"
+    if removed > 0 and readings and not readings[-1].passed:
+        yield write_check(CheckKind.TOO_SHARP, removed)
+    if restoration.posterior is None:
+        return
     if restoration.blur is not None and not math.isfinite(restoration.blur.uncertainty):
-        yield "the width of the blur could not be measured"
-    if done.sigma > 0 and not done.converged:
-        yield "the deconvolution has not converged"
+        yield write_check(CheckKind.BLUR_UNKNOWN)
+        return
+    low, width, high = map(float, restoration.posterior.width)
+    if width <= _SEEN_BLUR:
+        return
+    if removed < min(low, _HALF * width):
+        kind = CheckKind.BLUR_LEFT if removed > 0 else CheckKind.NO_BLUR_REMOVED
+        yield write_check(kind, width, low, high, removed)
+    elif high > _OFF**2 * low:
+        yield write_check(CheckKind.BLUR_UNCERTAIN, removed, low, high)
+
+
+def _share_of_air(flows: FloatArray) -> float:
+    """Share of the motion, flows (T, H, W, 2), that is no shift of whole frames."""
+    some = flows[:, ::4, ::4] - flows[:, ::4, ::4].mean(axis=0)
+    shifts = np.median(some, axis=(1, 2), keepdims=True)
+    return float(np.linalg.norm(some - shifts) / max(float(np.linalg.norm(some)), 1e-9))
+
+
+def _removed(restoration: Restoration) -> float:
+    return 0.0 if restoration.deconvolution is None else float(restoration.deconvolution.sigma)
+
+
+def _disputed(restoration: Restoration) -> float:
+    """Share of the mean in the result, where each pixel counts by the energy of the detail that the mean has there."""
+    share = restoration.disagreement
+    if share is None:
+        return 0.0
+    x, y, width, height = restoration.crop
+    detail = np.hypot(*sobel_gradient(luminance(restoration.mean[y : y + height, x : x + width]))) ** 2
+    return float((share * detail).sum() / max(float(detail.sum()), 1e-12))

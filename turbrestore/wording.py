@@ -10,6 +10,7 @@ from .blind.structure import LASTING, LEFT, UNSEEN, StructureReading
 from .core.arrays import FloatArray
 from .core.decision import Decision
 from .core.remarks import counted
+from .core.verdict import Check, CheckKind
 from .dynamics.flow_model import FlowDynamics, mean_flow_error
 from .filtering.alternating import Filtered
 from .registration.camera.global_shift import DEAD_ZONE
@@ -29,6 +30,75 @@ _REPORTED_SHARE = 0.01
 FEW_FRAMES = 5
 # Motion beyond this share of the shorter side is too large for optical flow in some places.
 _LARGE_MOTION = 1 / 12
+
+
+# What is doubtful, and what to do about it.
+_CHECKS = {
+    CheckKind.INPUT: ("{0}", "ignore this if it is what you expect"),
+    CheckKind.SATURATED: ("{0}", "expose shorter; ignore this where what is white has no detail"),
+    CheckKind.LARGE_MOTION: ("{0}", "--frames FIRST:END with the frames that move less"),
+    CheckKind.SCENE_CHANGES: (
+        "the scene itself changes during the clip, so the mean of the frames is the result",
+        "--frames FIRST:END with the frames during which it does not",
+    ),
+    CheckKind.CONTRADICTION: (
+        "the frames contradict the filtered image, so their mean is the result",
+        "--roi X,Y,WIDTH,HEIGHT of a part without water or whatever moves by itself",
+    ),
+    CheckKind.REPETITION: (
+        "the scene repeats every {0:.1f} pixels and moves by {1:.1f}, so parts may have slipped by one repetition",
+        "take the mean of the frames if lines are broken that are whole there",
+    ),
+    CheckKind.FEW_FRAMES: ("{0} average out neither the motion nor the noise", "use at least eight"),
+    CheckKind.GEOMETRY: (
+        "lines may be bent, because {1} tell the geometry to {0:.1f} pixels only",
+        "use more frames; ignore this if only sharpness matters",
+    ),
+    CheckKind.AGREEMENT: (
+        "the frames do not agree on {0:.0%} of the detail, which is that of their mean",
+        "use more frames",
+    ),
+    CheckKind.MOTION: (
+        "motion that the frames do not agree on: registration leaves {0:.0%} of their differences",
+        "--frames FIRST:END with the frames during which the scene stays the same",
+    ),
+    CheckKind.UNSEEN: ("{0} of the image is seen in hardly any frame", "--border crop"),
+    CheckKind.NO_BLUR_REMOVED: (
+        "no blur is removed, although {0:.2f} pixels were measured ({1:.2f} to {2:.2f})",
+        "--sigma {0:.2f} removes it; ignore this if edges ring then",
+    ),
+    CheckKind.BLUR_LEFT: (
+        "{3:.2f} pixels of blur are removed, although {0:.2f} were measured ({1:.2f} to {2:.2f})",
+        "--sigma {0:.2f} removes all; ignore this if edges ring then",
+    ),
+    CheckKind.BLUR_UNCERTAIN: (
+        "{0:.2f} pixels of blur are removed, but {1:.2f} to {2:.2f} are possible",
+        "--sigma {2:.2f} shows whether more is better",
+    ),
+    CheckKind.BLUR_UNKNOWN: (
+        "the width of the blur could not be measured, and none is removed",
+        "--sigma 1 removes a usual one",
+    ),
+    CheckKind.TOO_SHARP: (
+        "at the width of {0:.2f} pixels that was given, edges ring or overshoot, or noise is amplified",
+        "leave out --sigma, so that the width is measured",
+    ),
+    CheckKind.DRIFT: (
+        "{0} of the image is averaged less, because the result drifted from the input",
+        "ignore this where something moves slowly",
+    ),
+}
+
+
+def write_check(kind: CheckKind, *figures: float | str) -> Check:
+    """Write what is doubtful, with its figures, and what to do about it."""
+    text, remedy = _CHECKS[kind]
+    return Check(kind, text.format(*figures), remedy.format(*figures))
+
+
+def share_words(share: float) -> str:
+    """Write a share of an image, which is not 0 % where there is one."""
+    return "less than 1 %" if 0 < share < 0.01 else f"{100 * share:.0f} %"
 
 
 def explain_training(train: int, frame_count: int, wanted: int | None) -> Decision:
@@ -52,7 +122,7 @@ def explain_input(saturated: float) -> tuple[Decision, ...]:
     if saturated <= _REPORTED_SHARE:
         return ()
     reason = f"{saturated:.0%} of the pixels are at full scale: detail is lost there, and edges may ring"
-    return (Decision("saturation", "left as it is", reason),)
+    return (Decision("saturation", "left as it is", reason, CheckKind.SATURATED),)
 
 
 def explain_registration(centroid: Centroid) -> tuple[Decision, ...]:
@@ -61,17 +131,21 @@ def explain_registration(centroid: Centroid) -> tuple[Decision, ...]:
 
 
 def explain_motion(flows: FloatArray) -> tuple[Decision, ...]:
-    """Report motion that is too large for optical flow.
+    """Report motion, about the shift of the whole frame, that is too large for optical flow.
 
     ``flows`` (T, H, W, 2).
     """
-    squares = sum(float(np.mean(np.square(flow), dtype=np.float64)) for flow in iter_frames(flows))
+    about = (flow - np.median(flow[::4, ::4], axis=(0, 1)) for flow in iter_frames(flows))
+    squares = sum(float(np.mean(np.square(flow), dtype=np.float64)) for flow in about)
     rms = float(np.sqrt(2 * squares / len(flows)))
     side = min(flows.shape[1:3])
     if rms < _LARGE_MOTION * side:
         return ()
-    reason = f"{rms:.1f} pixels in an image of {side} pixels a side: optical flow fails in places and doubles details"
-    return (Decision("motion", "taken as measured", reason),)
+    reason = (
+        f"{rms:.1f} pixels about the shift of the whole in an image of {side} pixels a side: optical flow fails in "
+        "places and doubles details"
+    )
+    return (Decision("motion", "taken as measured", reason, CheckKind.LARGE_MOTION),)
 
 
 def explain_camera(flows: FloatArray) -> tuple[Decision, ...]:
@@ -138,8 +212,7 @@ def explain_structure(reading: StructureReading) -> tuple[Decision, ...]:
     if reading.changes:
         reason = (
             f"registration leaves {reading.left:.0%} of the differences of the frames (bound {LEFT:.0%}), and "
-            f"{reading.lasting:.0%} of that lasts for half of the clip (bound {LASTING:.0%}): the scene itself "
-            "changes; use fewer frames (--frames 0:N), during which it does not"
+            f"{reading.lasting:.0%} of that lasts for half of the clip (bound {LASTING:.0%}): the scene itself changes"
         )
         if reading.explained:
             return (Decision("changing scene", "no blur is removed", reason),)

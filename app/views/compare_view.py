@@ -78,7 +78,7 @@ class CompareView:
         height, width = found.image.shape[:2]
         whole = restored is self._tab.restored
         what = f"{width}×{height} pixels from {found.frame_count} frames in {sum(found.seconds.values()):.1f} s"
-        note = what if whole else f"Preview of a part: {what}"
+        note = what if whole else f"Preview of a part: {what}. Run restores the whole, which can be tuned and saved"
         images = stages(found, restored.frame)
         if found.finer is not None:
             images["finer"] = found.finer

@@ -13,6 +13,20 @@ from nicegui import ui
 from ..folders import printable
 from ..job import one_line
 
+# What the page calls the options that errors name; longer ones first.
+_LABELS = {
+    "allow overwriting": "tick Replace existing files",
+    "--reference": "Reference for the geometry",
+    "--keep-best": "Keep best",
+    "--overwrite": "Replace existing files",
+    "--bit-depth": "Depth",
+    "--derotate": "Turn a planet back",
+    "--frames": "Frames",
+    "--sigma": "Width",
+    "--scale": "Grid of the result",
+    "--roi": "Region",
+}
+
 Arguments = TypeVarTuple("Arguments")
 Result = TypeVar("Result")
 
@@ -53,8 +67,15 @@ class Notices:
 
     def tell(self, message: str) -> None:
         """Show one line above all, or none."""
-        self._error.text = printable(message)
+        self._error.text = printable(labelled(message))
         self._error.visible = bool(message)
+
+
+def labelled(message: str) -> str:
+    """Name the fields of the page in place of the options that an error names."""
+    for option, label in _LABELS.items():
+        message = message.replace(option, label)
+    return message
 
 
 class Command:

@@ -108,8 +108,8 @@ class Page:
         self.notices.name(clip.name)
         self.open_view.opened()
         self.run_view.opened()
-        if self.tab.restored is not None:
-            self.run_view.take_over(self.tab.restored.order)
+        if self.tab.ordered is not None:
+            self.run_view.take_over(self.tab.ordered)
         self.save_view.opened()
         self.tune_view.opened()
         self.steady_view.opened()
@@ -146,11 +146,13 @@ class Page:
         self._refresh()
 
     async def _show_result(self, job: Job[object]) -> None:
-        """Show what a run has made; after several clips, what there was before."""
+        """Show what a run has made; after several clips, their rows and what there was before."""
         if job.kind == "steady":
             self.video_view.fill()
             self.look_at("video")
             return
+        if job.kind == "several":
+            self.several_view.look()
         result = self.tab.restored if job.kind == "several" else job.result
         if not isinstance(result, Restored):
             self.compare_view.clear()

@@ -80,6 +80,13 @@ class ProgressView:
         self._ended = state != "running"
         return job if self._ended else None
 
+    def show_tuned(self, pending: bool) -> None:
+        """Take the verdict back while what is seen was tuned since the run, and bring it again."""
+        job = self._job
+        if job is not None and self._ended and job.state == "done" and job.message:
+            told = "The verdict follows when what was tuned is applied." if pending else job.message
+            self._state.text = f"Finished in {job.seconds:.1f} s. {told}"
+
     def _show_nothing(self) -> None:
         self._clear()
         self._stop.visible = self._state.visible = self._stages.visible = self._decided.visible = False

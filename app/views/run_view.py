@@ -95,6 +95,7 @@ class RunView:
         """Say that the next run removes the blur that was chosen, where one was."""
         self._method.text = "" if params is None else f"Removes {params.sigma:.2f} pixels of blur, as chosen in Tune."
         self._method.visible = params is not None
+        self._progress.show_tuned(self._tab.pending)
 
     def set_region(self, roi: Roi | None) -> None:
         """Take over a region that was drawn."""

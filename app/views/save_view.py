@@ -65,6 +65,8 @@ class SaveView:
     async def _save(self) -> None:
         """Save what is seen: what was tuned is applied to the whole first."""
         tab = self._tab
+        # An earlier note says nothing of what goes wrong now.
+        self._note.text = ""
         with self._notices.catching():
             clip, image = tab.clip, tab.folders.output(self._path.value or "")
             outputs = Outputs(image, self._depth.value, bool(self._report.value), bool(self._overwrite.value))

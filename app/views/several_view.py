@@ -81,6 +81,10 @@ class SeveralView:
             self._rows.content = f'<table class="rows">{rows}</table>'
         return self._progress.follow()
 
+    def look(self) -> None:
+        """Bring the rows into sight, which are far below the picture on a phone."""
+        ui.run_javascript("document.querySelector('table.rows')?.scrollIntoView({ block: 'nearest' })")
+
     def _choose_all(self) -> None:
         """Choose all clips, or none where all are chosen."""
         wanted = not all(box.value for _, box in self._boxes)

@@ -126,19 +126,21 @@ class StackingView:
     def _list(self, found: QualityList) -> None:
         """List what shares cost and gain; each can be chosen."""
         with self._shares:
-            for words in ("Keep", "Frames", "Noise", "Sharpness"):
+            for words in ("Keep", "Frames", "Noise", "Sharpness", "Worth"):
                 ui.label(words).classes("what")
-            for one in (*found.kept, found.suggested):
+            suggested = () if found.suggested is None else (found.suggested,)
+            for one in (*found.kept, *suggested):
                 percent = max(1, round(100 * one.share))
                 button = ui.button(f"{percent} %", on_click=partial(self._keep.set_value, percent))
                 button.props("outline dense no-wrap")
                 if one is found.suggested:
                     button.props(f'aria-label="{percent} %, suggested"')
-                for words in (str(one.frames), f"{one.noise:.2f}×", f"{one.sharpness:.2f}×"):
+                for words in (str(one.frames), f"{one.noise:.2f}×", f"{one.sharpness:.2f}×", f"{one.worth:.2f}×"):
                     ui.label(words)
+        said = "The last row is suggested." if suggested else "All frames are worth as much as any share."
         named = [str(self._range[0] + int(place)) for place in found.order]
         self._named.text = (
-            f"The last row is suggested: there detail exceeds noise most. The sharpest frames are "
+            f"{said} Worth is detail over noise and error, all frames = 1. The sharpest frames are "
             f"{', '.join(named[:_NAMED])}, the softest {', '.join(named[: -_NAMED - 1 : -1])}."
         )
 

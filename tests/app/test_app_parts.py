@@ -30,6 +30,7 @@ from turbrestore_app.saving import Outputs, check_outputs, command_line, save
 from turbrestore_app.several import inputs_of, plan_several
 from turbrestore_app.tab import Tab
 from turbrestore_app.tuning import impressions, part_around, tuned_params
+from turbrestore_app.views.elements import labelled
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.options import Selection
 
@@ -262,6 +263,14 @@ class TestTab:
         with pytest.raises(DataError):
             tab.open(folder / "notes.txt")
         assert not tab.busy
+
+
+def test_errors_name_the_fields_of_the_page():
+    assert labelled("a.png: exists already; choose another name or allow overwriting").endswith(
+        "choose another name or tick Replace existing files"
+    )
+    assert labelled("--frames: expected start:stop, found '1'") == "Frames: expected start:stop, found '1'"
+    assert labelled("--roi: expected 4 numbers") == "Region: expected 4 numbers"
 
 
 class TestSeveral:

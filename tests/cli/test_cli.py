@@ -251,10 +251,11 @@ class TestRestore:
         last = err.splitlines()[-1]
         assert f"; check: {doubt}" in last and remark not in last
         page = (tmp_path / "o.html").read_text("utf-8")
-        assert f"<li>{doubt}</li>" in page and f"Remark: {remark}" in page and f"Remark: {doubt}" not in page
+        assert f"<li>{doubt}<br>" in page and f"Remark: {remark}" in page and f"Remark: {doubt}" not in page
         record = json.loads(run(*words, "--json", "--overwrite")[1])
         assert record["warnings"] == [remark, doubt]
-        assert last.endswith(f"; check: {'; '.join(record['verdict']['checks'])}")
+        checks = [f"{check['text']} ({check['remedy']})" for check in record["verdict"]["checks"]]
+        assert last.endswith(f"; check: {'; '.join(checks)}")
 
     def test_overwrite_is_explicit(self, run, clip, tmp_path):
         output = tmp_path / "o.png"

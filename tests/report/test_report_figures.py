@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from turbrestore.core.arrays import from_unit
+from turbrestore.core.noise_spectrum import RINGS, NoiseSpectrum
 from turbrestore.display.curves import plot_convergence, plot_filter
 from turbrestore.display.maps import plot_flow
 from turbrestore.display.spectra import plot_eigenvalues
 from turbrestore.report import facts, pictures
 from turbrestore.report.alignment import align_curves, align_map, take_title
+from turbrestore.report.detail import detail_spectrum
 from turbrestore.report.vector import inline_svg
 
 from .conftest import Elements, decoded
@@ -104,3 +106,22 @@ def test_svg_has_no_styles_and_scoped_names():
     assert all(address.startswith(("#map-", "data:image/")) for address in elements.values("href"))
     assert "Displacement of one frame, pixels" in elements.text["text"]
     assert svg == inline_svg(plot_flow(np.ones((24, 32, 2)), np.zeros((24, 32))), "map", 'say "<this>"')
+
+
+def test_detail_ends_where_the_noise_is_as_strong(whole):
+    # White noise over a scene whose power falls as a Gaussian: both are known, and so is where they meet.
+    rng, deviation, width = np.random.default_rng(0), 0.02, 1.5
+    field = rng.standard_normal((160, 200))
+    nu = np.hypot(*np.meshgrid(np.fft.fftfreq(200), np.fft.fftfreq(160)))
+    transfer = np.exp(-2 * np.pi**2 * width**2 * nu**2)
+    scene = np.fft.ifft2(np.fft.fft2(field) * transfer).real
+    image = (scene + deviation * rng.standard_normal(scene.shape)).astype(np.float32)
+    noise = NoiseSpectrum(np.full(len(RINGS), deviation**2), np.zeros(len(RINGS)), np.zeros(len(RINGS)))
+    known = dataclasses.replace(
+        whole, noise=noise, filtered=dataclasses.replace(whole.filtered, image=image), crop=(0, 0, 200, 160)
+    )
+    found = detail_spectrum(known)
+    meet = np.sqrt(-np.log(deviation) / (2 * np.pi**2 * width**2))
+    assert found.limit == pytest.approx(meet, abs=1.5 * RINGS[1])
+    assert (found.signal[found.frequencies < meet - 2 * RINGS[1]] > found.noise[0]).all()
+    assert detail_spectrum(dataclasses.replace(whole, noise=None)) is None

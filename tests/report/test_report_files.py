@@ -119,7 +119,7 @@ def swap_image(folder):
 def swap_share(folder):
     with np.load(folder / "images.npz") as archive:
         arrays = dict(archive)
-    np.savez(folder / "images.npz", **arrays, disagreement=np.full(arrays["image"].shape[:2], 1.5, np.float32))
+    np.savez(folder / "images.npz", **{**arrays, "disagreement": np.full(arrays["image"].shape[:2], 1.5, np.float32)})
 
 
 DAMAGE = {

@@ -13,6 +13,7 @@ import pytest
 from turbrestore.blind.guards import GuardReading
 from turbrestore.core.arrays import from_unit
 from turbrestore.core.decision import Decision
+from turbrestore.core.verdict import CheckKind
 from turbrestore.pipeline import restore
 from turbrestore.report import facts, render_report
 from turbrestore.runs.run_record import RunRecord
@@ -85,7 +86,7 @@ class TestPage:
             assert word in text
         assert f"{whole.posterior.width[1]:.2f} px" in text and f"{whole.posterior.removed:.2f} px removed" in text
         labels = [a["aria-label"] for tag, a in Elements(page).found if tag == "svg" and "aria-label" in a]
-        assert len(labels) == 11 + bool(whole.deconvolution.recorded.size)
+        assert len(labels) == 11
         for stage in whole.seconds.values():
             assert f"{stage:.2f} s" in text
 
@@ -118,9 +119,9 @@ class TestPage:
     def test_doubts_stand_at_the_top(self, whole, run):
         sure = render_report(dataclasses.replace(whole, guard_readings=()), run)
         doubt, remark = "cut short after 6 whole frames; the others are missing", "1 duplicated: frame 3 left out"
-        doubted = dataclasses.replace(whole, decisions=(Decision("input", "to be checked", doubt),))
+        doubted = dataclasses.replace(whole, decisions=(Decision("input", "to be checked", doubt, CheckKind.INPUT),))
         page = render_report(doubted, dataclasses.replace(run, warnings=(doubt, remark)))
-        assert page.index(f"<li>{doubt}</li>") < page.index(f"Remark: {remark}") < page.index('<dl class="headline">')
+        assert page.index(f"<li>{doubt}<br>") < page.index(f"Remark: {remark}") < page.index('<dl class="headline">')
         assert page.count(remark) == 1 and f"Remark: {doubt}" not in page
         assert "times as sharp as the mean of 6 frames" in sure
 

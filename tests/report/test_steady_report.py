@@ -31,7 +31,7 @@ def sources():
 def report(sources, tmp_path_factory):
     masks = np.zeros((COUNT, HEIGHT, WIDTH), bool)
     masks[:, :, : WIDTH // 2] = True
-    figures = SteadyFigures([0.5] * COUNT, [0.25] * COUNT, 2, 1.25, 4.0)
+    figures = SteadyFigures([0.5] * COUNT, [0.25] * COUNT, [0.0] * COUNT, 2, 1.25, 4.0)
     command = ("turbrestore", "steady", EVIL, "o.mkv")
     path = tmp_path_factory.mktemp("report") / "report.html"
     write_steady_report(path, sources, masks, figures, describe_run(sources[0], {"camera": "lock"}, command))

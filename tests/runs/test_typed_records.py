@@ -46,5 +46,5 @@ def test_a_message_names_the_place_what_was_expected_and_what_was_found():
 
 
 def test_a_record_of_an_earlier_version_has_an_empty_part_for_a_deblurring_to_come(tmp_path):
-    (tmp_path / "run.json").write_text('{"schema": 4, "facts": {"centroid": {}}, "deblurred": {}, "outputs": []}')
+    (tmp_path / "run.json").write_text('{"schema": 5, "facts": {"centroid": {}}, "deblurred": {}, "outputs": []}')
     assert read_stages(tmp_path) == KeptRecord({"centroid": {}})

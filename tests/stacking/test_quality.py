@@ -38,11 +38,24 @@ def test_a_share_costs_noise_and_gains_sharpness():
     assert found.kept[1].sharpness == pytest.approx(float(ratio[0]), rel=0.1)
 
 
-def test_the_suggested_share_falls_with_the_spread_of_quality_and_rises_with_noise():
-    alike, varied = np.full(40, 1.2), np.linspace(0.5, 4, 40) ** 1.2
-    assert quality_list(frames(alike, 0.01)).suggested.share > 0.85
-    shares = [quality_list(frames(varied, noise)).suggested.share for noise in (0.001, 0.01, 0.04)]
-    assert shares[0] < shares[1] <= shares[2] < 0.9
+def test_the_suggested_share_rises_with_noise_and_is_worth_most():
+    varied = np.linspace(0.5, 4, 40) ** 1.2
+    lists = [quality_list(frames(varied, noise)) for noise in (0.001, 0.01, 0.04)]
+    shares = [found.suggested.share for found in lists]
+    assert shares[0] <= shares[1] <= shares[2] < 0.9
+    for found in lists:
+        # The table does not contradict what it suggests, and fewer frames would draw a check of their own.
+        assert found.suggested.worth >= max(1.05, *(one.worth for one in found.kept if one.frames >= 8))
+        assert found.suggested.frames >= 8
+
+
+def test_no_share_is_suggested_where_all_frames_are_as_good():
+    # A few frames are a little sharper: sharpness × 1.03 is not worth noise × 2.
+    nearly = np.linspace(1.15, 1.25, 40)
+    for blurs in (np.full(40, 1.2), nearly):
+        found = quality_list(frames(blurs, 0.002))
+        assert found.suggested is None
+        assert "no share is suggested" in quality_table(found, range(40))
 
 
 def test_the_command_prints_the_list(run, tmp_path):
@@ -56,5 +69,5 @@ def test_the_command_prints_the_list(run, tmp_path):
     assert any(line.split()[1:2] == ["8"] for line in lines if line.startswith("27% "))
     record = json.loads(run("info", tmp_path / "a.npy", "--quality", "--json")[1])["quality"]
     assert [row["frame"] for row in record["quality"][:3]] == [0, 1, 2]
-    assert record["suggested"]["frames"] >= 1
+    assert record["suggested"]["worth"] > 1
     assert "100.0%" in quality_table(quality_list(frames([1, 2], 0.01)), [4, 7])

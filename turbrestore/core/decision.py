@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from .verdict import CheckKind
+
 
 @dataclass(frozen=True)
 class Decision:
@@ -17,6 +19,8 @@ class Decision:
         The choice, one line.
     reason : str
         The figures that led to the choice, one line.
+    check : CheckKind or None
+        What it makes doubtful about the result, whatever was chosen.
 
     Examples
     --------
@@ -30,6 +34,7 @@ class Decision:
     subject: str
     choice: str
     reason: str
+    check: CheckKind | None = None
 
     def __str__(self) -> str:
         return f"{self.subject}: {self.choice}; {self.reason}"

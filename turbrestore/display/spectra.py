@@ -1,4 +1,4 @@
-"""Singular values and eigenvalues of the flow model: arrays in, a matplotlib figure out.
+"""Signal and noise of an image, singular values and eigenvalues of the flow model: arrays in, a figure out.
 
 Symbols: ξ and C are states and modes of the flow, A the transition, τ the number of flows.
 """
@@ -19,6 +19,25 @@ if TYPE_CHECKING:
 
 # Singular values below this share of the largest are rounding errors.
 _ROUNDING = 1e-5
+
+
+def plot_signal(frequencies: ArrayLike, signal: ArrayLike, noise: ArrayLike, limit: float) -> Figure:
+    """Show the power of signal and noise over the frequency, cycles per pixel, and up to where the signal is stronger.
+
+    ``frequencies``, ``signal``, ``noise`` (k,).
+    """
+    figure = new_figure()
+    axes = add_axes(figure, "Signal and noise: what the clip tells", "frequency, cycles per pixel", "power")
+    nu, of_noise = np.asarray(frequencies, float), np.asarray(noise, float)
+    least = 0.1 * float(of_noise.min())
+    axes.axvspan(0, limit, color=ACCENT, alpha=0.12, linewidth=0)
+    axes.plot(nu, np.maximum(np.asarray(signal, float), least), color=ACCENT, linewidth=1.4, label="signal")
+    axes.plot(nu, of_noise, color=INK, linewidth=1.2, linestyle="--", label="noise")
+    axes.set_yscale("log")
+    axes.set_ylim(bottom=least)
+    axes.set_xlim(0, nu[-1])
+    axes.legend(frameon=False, fontsize=FONT, labelcolor=INK)
+    return figure
 
 
 def plot_singular_values(singular_values: ArrayLike, rank: int) -> Figure:

@@ -11,11 +11,15 @@ from typing import Any
 import numpy as np
 
 from ..core.remarks import counted
+from ..registration.coverage import coverage
 from ..results import Restoration
 from ..runs.run_record import RunRecord
 from ..settings import RestoreParams
 from ..wording import interval_words
+from .detail import detail_spectrum
 
+# Share of the frames that show the interior.
+_SEEN = 0.9
 _STAGE_NAMES = {
     "read": "Reading",
     "centroid": "Centroid",
@@ -162,6 +166,10 @@ def _blur_facts(restoration: Restoration) -> Iterator[Fact]:
         value = f"{blur.sigma:.2f} ± {blur.uncertainty:.2f} px" if known else f"{blur.sigma:.2f} px"
         note = f"evidence {blur.evidence:.2f}, image reduced {blur.reduction}×" if known else "cannot be measured"
         yield Fact("Estimated blur", value, note, not known)
+    found = detail_spectrum(restoration)
+    if found is not None:
+        note = f"{found.limit:.2f} cycles per pixel: beyond, noise is stronger than the scene"
+        yield Fact("Finest detail", f"{1 / found.limit:.1f} px a period", note)
     if done is not None:
         yield Fact("Noise before deblurring", f"{100 * done.noise:.2f} %", "of full scale")
         if done.sigma > 0:
@@ -203,14 +211,14 @@ def _uncertainty_facts(restoration: Restoration) -> Iterator[Fact]:
     deviation = restoration.uncertainty
     if deviation is None:
         return
+    x, y, width, height = restoration.crop
     known = np.isfinite(deviation)
-    if known.any():
-        middle, high = (100 * float(value) for value in np.quantile(deviation[known], (0.5, 0.95)))
-        yield Fact(
-            "Standard deviation of a pixel",
-            f"{middle:.2f} %",
-            f"of full scale in the median; below {high:.2f} % in 95 % of the pixels",
-        )
+    # Few frames show the border, and its deviation says nothing of the rest.
+    interior = known & (coverage(restoration.centroid.flows)[y : y + height, x : x + width] >= _SEEN)
+    if interior.any():
+        middle, high = (255 * float(value) for value in np.quantile(deviation[interior], (0.5, 0.95)))
+        note = f"of 255, in the median of what nine frames in ten show; below {high:.1f} in 95 % of it"
+        yield Fact("Standard deviation of a pixel", f"{middle:.1f} grey levels", note)
     if not known.all():
         value = f"{100 * (1 - known.mean()):.1f} % of the pixels"
         yield Fact("Without information", value, "saturated, or seen in no frame", True)
@@ -219,8 +227,8 @@ def _uncertainty_facts(restoration: Restoration) -> Iterator[Fact]:
 def _blur_note(restoration: Restoration) -> str:
     blur = restoration.blur
     if restoration.posterior is not None:
-        low, _, high = restoration.posterior.width
-        return f"measured {low:.2f} to {high:.2f}"
+        low, width, high = restoration.posterior.width
+        return f"measured {width:.2f} ({low:.2f} to {high:.2f})"
     if blur is None:
         return "as requested"
     if not math.isfinite(blur.uncertainty):

@@ -88,7 +88,13 @@ def render_report(restoration: Restoration, run: RunRecord) -> str:
         run=run,
         restoration=restoration,
         comparison=comparison(gallery),
-        groups=[[panel for panel in panels if panel.is_map == wanted] for wanted in (True, False)],
+        plots=[
+            [
+                [panel for panel in panels if (panel.is_special, panel.is_map) == (special, wanted)]
+                for wanted in (True, False)
+            ]
+            for special in (False, True)
+        ],
         headline=headline(restoration),
         findings=findings(restoration),
         verdict=restoration.verdict,

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..blur.posterior import BlurPosterior
-from ..blur.psf import radial_otf
-from ..deconvolution.deconvolve import Deconvolution
-from ..display.curves import plot_blur, plot_convergence, plot_filter, plot_frames, plot_objective
+from ..display.curves import plot_blur, plot_convergence, plot_filter, plot_frames
 from ..display.maps import plot_disagreement, plot_displacements, plot_flow, plot_uncertainty
-from ..display.spectra import plot_eigenvalues, plot_singular_values
-from ..display.witnesses import plot_transfer, plot_variation, plot_witnesses
+from ..display.spectra import plot_eigenvalues, plot_signal, plot_singular_values
+from ..display.witnesses import plot_witnesses
 from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import Filtered
 from ..results import Restoration
 from ..runs.run_record import RunRecord
 from .alignment import align_curves, align_map, take_title
+from .detail import detail_spectrum
 from .vector import inline_svg
 
 if TYPE_CHECKING:
@@ -35,6 +34,7 @@ class Panel:
     svg: Markup  # the ``<svg>`` element
     caption: str  # what the plot shows, and what to look for
     is_map: bool  # whether it has the shape of the image; maps come before the curves
+    is_special: bool = False  # whether only specialists look for it
 
 
 def make_panel(figure: Figure, name: str, description: str, caption: str) -> Panel:
@@ -49,29 +49,42 @@ def make_panel(figure: Figure, name: str, description: str, caption: str) -> Pan
 
 def draw_panels(restoration: Restoration, run: RunRecord) -> list[Panel]:
     """Draw the plots of all stages that have run."""
-    panels = [*_motion(restoration, run)]
+    stages = [*_motion(restoration, run)]
     if restoration.dynamics is not None:
-        panels += _dynamics(restoration.dynamics)
+        stages += _dynamics(restoration.dynamics)
     if restoration.filtered is not None:
-        panels += _filter(restoration.filtered)
-    if restoration.posterior is not None:
-        panels += _witnesses(restoration.posterior)
-    elif restoration.blur is not None:
-        blur = restoration.blur
-        figure = plot_blur(blur.widths, blur.costs, blur.sigma, blur.uncertainty)
-        caption = "The minimum is the estimated width; the band shows its uncertainty."
-        panels.append(make_panel(figure, "blur", "Cost of every width of the blur", caption))
-    if restoration.deconvolution is not None and restoration.deconvolution.recorded.size:
-        panels += _deconvolution(restoration.deconvolution)
+        stages += _filter(restoration.filtered)
+    return [*_trust(restoration), *_detail(restoration), *(replace(panel, is_special=True) for panel in stages)]
+
+
+def _trust(restoration: Restoration) -> Iterator[Panel]:
+    """Draw where the image is to be trusted."""
     if restoration.uncertainty is not None:
         figure = plot_uncertainty(restoration.uncertainty, restoration.image)
         caption = "Where not to trust the result: bright means uncertain, and brightest also where nothing is known."
-        panels.append(make_panel(figure, "uncertainty", "Map of the standard deviation of every pixel", caption))
+        yield make_panel(figure, "uncertainty", "Map of the standard deviation of every pixel", caption)
     if restoration.disagreement is not None and restoration.disagreement.any():
         figure = plot_disagreement(restoration.disagreement, restoration.image)
         caption = "Bright: the frames do not agree on the detail of the result, or it rings; the mean takes its place."
-        panels.append(make_panel(figure, "agreement", "Map of the share of the mean in the detail", caption))
-    return panels
+        yield make_panel(figure, "agreement", "Map of the share of the mean in the detail", caption)
+
+
+def _detail(restoration: Restoration) -> Iterator[Panel]:
+    """Draw how fine the detail is that the frames tell, and how wide its blur is."""
+    found, posterior, blur = detail_spectrum(restoration), restoration.posterior, restoration.blur
+    if found is not None:
+        figure = plot_signal(found.frequencies, found.signal, found.noise, found.limit)
+        caption = (
+            "Power of the scene, with its blur, and of the noise (dashed) in the filtered image. The clip tells detail "
+            f"up to {found.limit:.2f} cycles per pixel, where the noise is as strong; beyond, sharpening shows noise."
+        )
+        yield make_panel(figure, "signal", "Power of signal and noise at every frequency", caption)
+    if posterior is not None:
+        yield _witnesses(posterior)
+    elif blur is not None:
+        figure = plot_blur(blur.widths, blur.costs, blur.sigma, blur.uncertainty)
+        caption = "The minimum is the estimated width; the band shows its uncertainty."
+        yield make_panel(figure, "blur", "Cost of every width of the blur", caption)
 
 
 def _motion(restoration: Restoration, run: RunRecord) -> Iterator[Panel]:
@@ -107,7 +120,7 @@ def _filter(filtered: Filtered) -> Iterator[Panel]:
     yield make_panel(figure, "frames", "Sharpness and share of each frame", caption)
 
 
-def _witnesses(posterior: BlurPosterior) -> Iterator[Panel]:
+def _witnesses(posterior: BlurPosterior) -> Panel:
     widths = {
         "motion": posterior.by_displacement,
         "variation": posterior.by_variation,
@@ -117,22 +130,4 @@ def _witnesses(posterior: BlurPosterior) -> Iterator[Panel]:
     widths = {name: found for name, found in widths.items() if np.isfinite(found).all()}
     figure = plot_witnesses(widths, posterior.removed)
     caption = "Each bar holds 68 % of the probability. Dashed: the width that is removed."
-    yield make_panel(figure, "witnesses", "Widths of the blur by each witness", caption)
-    curves = {"lowest": posterior.lowest, "mean": posterior.transfer, "highest": posterior.highest}
-    removed = radial_otf(posterior.frequencies, posterior.removed, posterior.exponent)
-    caption = "The band holds 68 % of the probability. Dashed: the transfer function that is removed."
-    figure = plot_transfer(posterior.frequencies, curves, removed)
-    yield make_panel(figure, "transfer", "Transfer function of the blur", caption)
-    rows = {
-        "amplitude": (posterior.variation, posterior.variation_error, posterior.expected_variation),
-        "power": (posterior.power_variation, posterior.power_variation_error, posterior.expected_power_variation),
-    }
-    caption = "Points: measured on the registered frames. Lines: expected by the posterior. A blur by the air varies."
-    figure = plot_variation(posterior.frequencies, rows)
-    yield make_panel(figure, "variation", "Variation of the spectra of the frames", caption)
-
-
-def _deconvolution(deconvolution: Deconvolution) -> Iterator[Panel]:
-    figure = plot_objective(deconvolution.recorded, deconvolution.objective)
-    caption = "The energy that the deconvolution minimises."
-    yield make_panel(figure, "objective", "Energy of the deconvolution in each iteration", caption)
+    return make_panel(figure, "witnesses", "Widths of the blur by each witness", caption)

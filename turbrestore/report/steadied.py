@@ -18,12 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
+from ..core.remarks import counted
+from ..core.verdict import CheckKind, Verdict
 from ..display.curves import plot_over_frames
 from ..io.output import atomic_write
 from ..io.source import FrameSource
 from ..metrics import sharpness
 from ..runs.run_record import RunRecord
 from ..steady.settings import SteadyParams
+from ..steady.video import SteadyFrame
+from ..wording import share_words, write_check
 from .comparison import environment, film_comparison
 from .facts import Fact, duration, settings
 from .film import film_length, write_film
@@ -33,6 +37,8 @@ from .panels import Panel, make_panel
 # Quality of the film as a rate factor of H.264.
 _RATE_FACTOR = 22
 _USUAL_RATE = 25.0
+# Share of the image from which it is worth saying that the long average drifted.
+_ASTRAY = 0.02
 
 
 @dataclass(eq=False)
@@ -42,9 +48,29 @@ class SteadyFigures:
     # Root mean square of the displacement that was removed, pixels.
     displacement: list[float] = field(default_factory=list)
     moving: list[float] = field(default_factory=list)  # share of the image that moves
+    let_go: list[float] = field(default_factory=list)  # share of the image that is averaged less
     scenes: int = 0
     sigma: float = 0.0  # width of the blur that was removed, pixels
     seconds: float = 0.0  # time of the run
+
+    def note(self, frame: SteadyFrame) -> None:
+        """Take note of the next frame."""
+        self.scenes += frame.starts_scene
+        self.sigma = frame.sigma
+        self.displacement.append(frame.displacement)
+        self.moving.append(float(frame.moving.mean()))
+        self.let_go.append(frame.let_go)
+
+    @property
+    def verdict(self) -> Verdict:
+        """What was gained, and what to look at."""
+        removed = [f"{np.mean(self.displacement):.2f} pixels of motion"]
+        if self.sigma > 0:
+            removed.append(f"{self.sigma:.2f} pixels of blur")
+        count, moves = counted(len(self.moving), "frame"), share_words(float(np.mean(self.moving)))
+        gained = f"{count} with {' and '.join(removed)} removed; {moves} of the image moves"
+        astray = float(np.mean(self.let_go))
+        return Verdict(gained, (write_check(CheckKind.DRIFT, share_words(astray)),) if astray >= _ASTRAY else ())
 
 
 def write_steady_report(
@@ -79,6 +105,7 @@ def write_steady_report(
         size=sources[0].shape[1:3],
         panels=_plots(figures, sharp, change),
         headline=_headline(figures, sharp, change),
+        verdict=figures.verdict,
         settings=settings(run, asdict(SteadyParams())),
         command=shlex.join(run.command),
     )  # fmt: skip
@@ -104,7 +131,10 @@ def _plots(figures: SteadyFigures, sharp: list[float], change: list[float]) -> l
     caption = "Displacement that was removed, root mean square, and share of the image that moves."
     motion = make_panel(plot_over_frames(removed), "motion", "Displacement and moving share of every frame", caption)
     rows = {"Sharpness, input = 1": sharp, "Change since the frame before, input = 1": change}
-    caption = "The output should be sharper than the input, and change less from frame to frame."
+    caption = (
+        "The output should be sharper than the input. It changes less where the air has moved the scene, and more "
+        "where something moves that is sharper now."
+    )
     quality = make_panel(plot_over_frames(rows, 1.0), "quality", "Sharpness and change of every frame", caption)
     return [motion, quality]
 
@@ -113,7 +143,7 @@ def _headline(figures: SteadyFigures, sharp: list[float], change: list[float]) -
     facts = [
         Fact("Displacement", f"{np.mean(figures.displacement):.2f} px", "removed, on average"),
         Fact("Blur removed", f"{figures.sigma:.2f} px" if figures.sigma > 0 else "none", "standard deviation"),
-        Fact("Moves", f"{100 * np.mean(figures.moving):.0f} %", "of the image"),
+        Fact("Moves", share_words(float(np.mean(figures.moving))), "of the image"),
     ]
     if np.isfinite(sharp).any():
         facts.append(Fact("Sharpness", f"×{np.nanmean(sharp):.2f}", "relative to the input"))

@@ -23,13 +23,16 @@ from .run_record import RunRecord
 from .stage_files import KINDS, load_artifact, save_artifact
 from .typed_records import KeptRecord, convert_to
 
-SCHEMA = 4
+SCHEMA = 5
 RECORD, IMAGES, MEAN = "run.json", "images.npz", "mean.npy"
 # All files of a kept run.
 RUN_FILES = (*(f"{name}.npz" for name in KINDS), MEAN, IMAGES, RECORD)
 _ANEW = "start anew without resuming, or keep the stages in another folder"
 # Fields of a restoration that lie in no other file.
-_DESCRIBED = ("crop", "guard_readings", "decisions", "train", "frame_count", "seconds", "seeing")
+_DESCRIBED = (
+    *("crop", "guard_readings", "decisions", "train", "frame_count", "seconds", "seeing"),
+    *("structure", "is_mean", "objects_replaced", "unseen"),
+)
 # Maps of the size of the result: the largest value, and what it is.
 _MAPS = {"uncertainty": (math.inf, "deviations"), "disagreement": (1.0, "shares")}
 # Where `turbrestore report` writes by default.

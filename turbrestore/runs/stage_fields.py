@@ -97,6 +97,7 @@ FIELDS: dict[str, dict[str, ArraySpec | NumberSpec]] = {
         "widths": ArraySpec("f8", "k", low=0),
         "costs": ArraySpec("f8", "k", low=-_INFINITE, high=_INFINITE),
     },
+    "noise": dict.fromkeys(("power", "error", "relative"), ArraySpec("f8", "k", low=0)),
     "posterior": {
         "width": ArraySpec("f8", "3", low=0),
         **dict.fromkeys(("by_displacement", "by_variation", "by_image"), ArraySpec("f8", "3", low=0, gaps=True)),

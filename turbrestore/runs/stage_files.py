@@ -21,6 +21,7 @@ from ..blur.estimation import BlurEstimate
 from ..blur.posterior import BlurPosterior
 from ..core.arrays import FloatArray, check_flow
 from ..core.errors import DataError, InputNotFoundError
+from ..core.noise_spectrum import NoiseSpectrum
 from ..deconvolution.deconvolve import Deconvolution
 from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import Filtered
@@ -44,6 +45,7 @@ KINDS: dict[str, type[DataclassInstance]] = {
     "dynamics": FlowDynamics,
     "filtered": Filtered,
     "blur": BlurEstimate,
+    "noise": NoiseSpectrum,
     "posterior": BlurPosterior,
     "deconvolution": Deconvolution,
 }
@@ -61,7 +63,7 @@ def save_artifact(path: str | os.PathLike[str], result: DataclassInstance, overw
     ----------
     path : path
         Must end in ``.npz``.
-    result : Centroid, FlowDynamics, Filtered, Deconvolution, BlurEstimate or BlurPosterior
+    result : Centroid, FlowDynamics, Filtered, Deconvolution, BlurEstimate, NoiseSpectrum or BlurPosterior
     overwrite : bool
         Replace an existing file.
 

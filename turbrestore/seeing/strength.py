@@ -138,7 +138,7 @@ class Seeing:
         if by_flow is None or by_blur is None or by_flow.overlaps(by_blur):
             return ""
         if by_blur.low > by_flow.high:
-            return "motion that the flow has missed, such as a moving scene or a failed registration"
+            return "motion that the frames do not agree on, such as a moving scene or a failed registration"
         # A mean that is blurred by more than the limit is no longer told apart from one that is blurred by the limit.
         if by_flow.value >= LARGEST_BLUR:
             return ""

@@ -8,9 +8,10 @@ z : noise of a frame over the mean brightness; f : 0.002 over that brightness, w
 n : frames that are kept, of T
 
 The mean of n registered frames has the mean amplitude of their detail and the noise ``z / √n``.  So sharpness gains
-``ā(n) / ā(T)`` and noise costs ``√(T / n)``.  The suggested share has the largest ``ā(n) / √(z² / n + f²)``: there
-detail exceeds noise and error most.  Frames that barely differ are all worth keeping, and a few that the air
-has spared are worth more than the rest only where noise is low.
+``ā(n) / ā(T)`` and noise costs ``√(T / n)``.  What a share is worth is ``ā(n) / √(z² / n + f²)`` over that of all
+frames: by how much more detail exceeds noise and error.  The share that is worth most is suggested, if it is worth more
+than all frames beyond the scatter of such figures.  Frames that barely differ are all worth keeping, and a few
+that the air has spared are worth more than the rest only where noise is low.
 """
 
 from __future__ import annotations
@@ -28,6 +29,8 @@ from ..footage.frame_selection import best_frames, frame_quality
 SHARES = (0.1, 0.25, 0.5)
 # Error of the models of blur and registration, intensity, as in Wiener deconvolution.
 _ERROR, _DARK = 0.002, 1e-3
+# Fewest frames that are suggested: those whose halves still tell what they agree on.  What a share has to be worth.
+_FEWEST, _WORTHWHILE = 8, 1.05
 # Best frames, and worst ones, that are listed.
 _LISTED = 10
 # Side of the image that the filter of the quality is tried on, pixels.
@@ -42,6 +45,7 @@ class KeptShare:
     frames: int
     noise: float  # of their mean over that of the mean of all frames
     sharpness: float  # fine detail of their mean over that of all frames, if both are registered
+    worth: float  # by how much more detail exceeds noise and error than with all frames, as a ratio
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +54,7 @@ class QualityList:
 
     quality: NDArray[np.float64]  # (T,): q_k, in the order of the frames
     kept: tuple[KeptShare, ...]  # for 10, 25 and 50 % of the frames
-    suggested: KeptShare
+    suggested: KeptShare | None  # None where all frames are better
 
     @property
     def order(self) -> NDArray[np.int64]:
@@ -76,23 +80,34 @@ def sort_by_quality(measured: NDArray[np.float64]) -> QualityList:
     z, f = float(np.median(noise / level)), _ERROR / float(np.median(level))
     sizes = np.arange(1, len(quality) + 1)
     means = np.cumsum(np.sort(np.sqrt(quality))[::-1]) / sizes
-    best = int(np.argmax(means / np.sqrt(z**2 / sizes + f**2)))
+    worth = means / np.sqrt(z**2 / sizes + f**2)
+    least = min(_FEWEST, len(sizes)) - 1
+    best = least + int(np.argmax(worth[least:]))
 
     def keeping(count: int) -> KeptShare:
         gain = means[count - 1] / means[-1] if means[-1] > 0 else 1.0
-        return KeptShare(count / len(quality), count, float(np.sqrt(len(quality) / count)), float(gain))
+        times = worth[count - 1] / worth[-1] if worth[-1] > 0 else 1.0
+        return KeptShare(count / len(quality), count, float(np.sqrt(len(quality) / count)), float(gain), float(times))
 
     kept = tuple(keeping(int(best_frames(quality, share).sum())) for share in SHARES)
-    return QualityList(quality, kept, keeping(best + 1))
+    found = keeping(best + 1)
+    return QualityList(quality, kept, found if found.worth > _WORTHWHILE else None)
 
 
 def quality_table(found: QualityList, numbers: Iterable[int]) -> str:
     """Write the list for a terminal: what shares cost and gain, and the best and the worst frames."""
     names = list(numbers)
-    lines = ["share kept   frames   noise   sharpness"]
-    rows = [*((f"{one.share:.0%}", one) for one in found.kept), (f"{found.suggested.share:.0%} *", found.suggested)]
-    lines += [f"{name:<10} {one.frames:>8} {one.noise:>6.2f}× {one.sharpness:>10.2f}×" for name, one in rows]
-    lines += ["* suggested: there detail exceeds noise most; restore weighs frames by itself", ""]
+    lines = ["share kept   frames   noise   sharpness   worth"]
+    rows = [(f"{one.share:.0%}", one) for one in found.kept]
+    if found.suggested is not None:
+        rows.append((f"{found.suggested.share:.0%} *", found.suggested))
+    lines += [
+        f"{name:<10} {one.frames:>8} {one.noise:>6.2f}× {one.sharpness:>10.2f}× {one.worth:>6.2f}×"
+        for name, one in rows
+    ]
+    all_better = "no share is suggested, as all frames are worth as much"
+    lines += [f"worth: detail over noise and error; {all_better if found.suggested is None else '* suggested'}"]
+    lines += ["restore weighs frames by itself", ""]
     top = float(found.quality.max()) or 1.0
     order = found.order
     places: list[int | None] = list(range(len(order)))
