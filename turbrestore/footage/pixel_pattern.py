@@ -39,12 +39,12 @@ from .survey import Moments, Survey
 class _Thresholds:
     """What tells a pattern of the sensor from the scene."""
 
-    frames: int = threshold(8, "frames", "theory: as for stripes of the sensor")
-    motion: float = threshold(0.3, "pixels", "theory: as for stripes of the sensor")  # least s
+    frames: int = threshold(8, "frames", "chosen: as for stripes of the sensor")
+    motion: float = threshold(0.3, "pixels", "chosen: as for stripes of the sensor")  # least s
     # Least deviation of fine detail of m in that of its noise.
     clear: float = threshold(4.0, "1", "measured: sixty clips without a pattern reach 1.7, patterns 11")
     # Most that P adds to v, relative to what would move.
-    static: float = threshold(0.25, "1", "theory: as for stripes of the sensor")
+    static: float = threshold(0.25, "1", "chosen: as for stripes of the sensor")
     steep: float = threshold(0.9, "1", "chosen: quantile of the slopes from which s is measured")
     # Deviations of P beyond which a pixel is of an overlay.
     outlier: float = threshold(5.0, "1", "measured: white noise reaches 4.5 in a frame")

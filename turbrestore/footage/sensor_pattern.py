@@ -38,7 +38,7 @@ class _Thresholds:
     across: float = threshold(3.0, "pixels", "test: test_offsets_of_columns_and_rows_are_subtracted")
     # Least offset, in standard errors of the mean of the frames and in intensity, that is worth a correction.
     clearly: float = threshold(4.0, "1", "chosen: half and double pass every test")
-    least: float = threshold(5e-4, "intensity", "bits: an eighth of a level of 8 bits")
+    least: float = threshold(5e-4, "intensity", "chosen: half and double pass every test")
     # Stripes of the sensor vary by less than this share of what moving stripes would.
     static: float = threshold(0.25, "1", "test: test_stripes_of_the_scene_are_left")
     # Gradient of the edges whose motion is measured, in deviations of the noise, and the least motion.
@@ -62,7 +62,7 @@ class _Thresholds:
     dead: float = threshold(0.3, "1", "chosen: half and double pass every test")
     around: int = threshold(9, "pixels", "chosen: half and double pass every test")
     most_dead: float = threshold(0.05, "1", "chosen: half and double pass every test")
-    noise: float = threshold(1 / 1020, "intensity", "bits: a quarter of a level of 8 bits; below, columns look dead")
+    noise: float = threshold(1 / 1020, "intensity", "chosen: half and double pass every test")
 
 
 _LIMITS = _Thresholds()

@@ -32,7 +32,7 @@ class _Thresholds:
     edges: float = threshold(0.1, "1", "test: test_air_that_calms_down_gives_no_repeats")  # share that counts as edges
     percentile: int = threshold(80, "%", "test: test_a_picture_that_stops_is_found_in_h264")
     # Largest d of a repeat: in units of σ, relative to the contrast of the frame, and relative to the usual d.
-    of_noise: float = threshold(0.7, "1", "theory: a repeat differs by less than σ, other frames by √2 σ")
+    of_noise: float = threshold(0.7, "1", "chosen: half and double pass every test")
     of_contrast: float = threshold(0.03, "1", "test: test_air_that_calms_down_gives_no_repeats")
     of_usual: float = threshold(1 / 3, "1", "chosen: half and double pass every test")
     # Shortest side of frames that are compared; fewer pixels are alike by chance.

@@ -31,12 +31,12 @@ from ..survey import Survey
 class _Thresholds:
     """What tells a white balance that hunts, and which pixels show it."""
 
-    side: int = threshold(64, "pixels", "cost: a longest side that takes no time beside the reading of a frame")
+    side: int = threshold(64, "pixels", "chosen: half and double pass every test")
     blur: float = threshold(1.5, "pixels", "chosen: half and double pass every test")  # of the reduced frames
     # Deviation over time, of the logarithm of a ratio.
     change: float = threshold(0.01, "1", "measured: below 0.004 for still scenes, 0.006 in a clip of skiers")
     dark: float = threshold(0.02, "intensity", "chosen: half and double pass every test")
-    saturated: float = threshold(0.98, "intensity", "bits: codecs and interpolation bring white to within 5 of 255")
+    saturated: float = threshold(0.98, "intensity", "test: test_channels_are_brought_to_their_mean, from below only")
     rounds: int = threshold(4, "fits", "chosen: half and double pass every test")
 
 
