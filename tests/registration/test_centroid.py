@@ -145,7 +145,7 @@ def test_a_moving_camera_costs_nothing(jitter, drift):
         psnr(find_centroid(stack, flow_params=params).image[seen], truth[seen])
         for stack, params in ((cuts, None), (still, None), (cuts, FlowParams(global_shift=False)))
     )
-    assert moving == pytest.approx(standing, abs=0.3)
+    assert moving > standing - 0.3
     assert lost < standing - 0.5
 
 

@@ -80,22 +80,26 @@ def noise_share(image: ArrayLike, noise: float) -> float:
 
 
 def regularise_flow(flow: FloatArray, tensors: Tensors, noise: float) -> FloatArray:
-    """Draw a flow (H, W, 2) towards its neighbourhood where the texture does not determine it."""
+    """Draw a flow towards its neighbourhood where the texture does not determine it.
+
+    ``flow`` (h, w, 2) on the grid of any of the tensors.
+    """
     planes = cv2.split(flow)
-    (xx, xy, yy), (dx, dy) = tensors[0], planes
+    finest = next(level for level, tensor in enumerate(tensors) if tensor.shape[1:] == flow.shape[:2])
+    (xx, xy, yy), (dx, dy) = tensors[finest], planes
     weighted = [(xx * dx + xy * dy, xy * dx + yy * dy)]
-    for _ in tensors[1:]:
+    for _ in tensors[finest + 1 :]:
         weighted.append((cv2.pyrDown(weighted[-1][0]), cv2.pyrDown(weighted[-1][1])))
     noise = max(noise, _LEAST_NOISE)
     u, v = (np.zeros_like(part) for part in weighted[-1])
-    for level in range(len(tensors) - 1, -1, -1):
+    for level in range(len(tensors) - 1, finest - 1, -1):
         height, width = tensors[level].shape[1:]
         if u.shape != (height, width):
             u, v = (cv2.pyrUp(part, dstsize=(width, height)) for part in (u, v))
         expected, (u, v) = (u, v), np.empty((2, height, width), np.float32)
         left = max(noise / 2**level, min(noise, _AVERAGED))
         prior = _METHOD_ERROR * left**2 / (_AREA * _DEVIATION**2)
-        planes_of_level = (*tensors[level], *weighted[level], *expected, u, v)
+        planes_of_level = (*tensors[level], *weighted[level - finest], *expected, u, v)
         posterior_mean(np.float32(prior), *(plane.reshape(-1) for plane in planes_of_level))
     for part, plane in zip((u, v), planes, strict=True):
         low, high, _, _ = cv2.minMaxLoc(plane)

@@ -17,7 +17,7 @@ surrounds them all:
    Pixels beyond the edge of the shifted frame are filled from the reference, so that they move with the shift.  If a
    frame has a start that moves as a whole, the shift is taken from the start.
 3. The method measures the flow.  That of dense inverse search is refined by steps at full resolution
-   (:mod:`turbrestore.registration.refinement_step`), and a start is refined without a search.
+   (:mod:`turbrestore.registration.refinement_step`).
 4. Where the texture of the reference does not determine the motion, the flow is drawn towards its neighbourhood
    (:mod:`turbrestore.registration.confidence`), so that flat regions move as their surroundings do.
 """
@@ -43,7 +43,7 @@ from ..runtime.threads import in_batches, map_ahead
 from .camera.global_shift import ShiftReference, frame_shift, prepare_shift_reference, shift_frame
 from .confidence import flow_confidence, noise_share, regularise_flow
 from .opencv_flow import DisParams, FarnebackParams, FlowSolver, GreyImage, dis_solver, farneback_solver
-from .refinement_step import RefineFlow, flow_refinement
+from .refinement_step import RefineFlow, flow_refinement, half_grid
 from .tvl1 import TvL1Params, tvl1_solver
 
 MIN_SIDE = 16
@@ -243,19 +243,18 @@ def prepare_reference(
         # Farneback's method takes no start.
         usable = [replace(frame, start=None) for frame in batch] if params.method == "farneback" else batch
         placed, starts, shifts = zip(*(_place(frame, normalised, position) for frame in usable), strict=True)
-        flows = list(starts)
-        anew = [number for number, start in enumerate(starts) if start is None or refine is None]
-        if anew:
-            found = solver(np.stack([placed[number] for number in anew]), [starts[number] for number in anew], draft)
-            for number, flow in zip(anew, found, strict=True):
-                flows[number] = flow
-        if refine is not None and not draft:
-            flows = [refine(*moved) for moved in zip(placed, flows, strict=True)]
+        flows = list(solver(np.stack(placed), list(starts), draft))
+        if refine is not None:
+            flows = [cv2.resize(flow, half_grid(shape)[::-1], interpolation=cv2.INTER_AREA) for flow in flows]
+            if not draft:
+                flows = [refine(*moved) for moved in zip(placed, flows, strict=True)]
         if confidence is not None:
             flows = [
                 regularise_flow(f, confidence, max(frame.noise, least_noise))
                 for f, frame in zip(flows, batch, strict=True)
             ]
+        if refine is not None:
+            flows = [cv2.resize(flow, shape[::-1], interpolation=cv2.INTER_LINEAR) for flow in flows]
         return [flow + shift if shift.any() else flow for flow, shift in zip(flows, shifts, strict=True)]
 
     # A device solves a batch at once while others are prepared; on the CPU every frame has a thread.
