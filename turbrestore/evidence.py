@@ -75,7 +75,7 @@ def evidence_of_frames(
 
 def _fused_noise(fused: Restoration, halves: HalvedClip) -> NoiseSpectrum:
     """Noise of the filtered image: that of the mean of the training frames, for as many frames as its weights leave."""
-    noise, filtered = halves.noise(), fused.filtered
+    noise, filtered = halves.alternate.noise(), fused.filtered
     if filtered is None:
         return noise
     # Σ / Z₀ is one over the number of frames that count.
@@ -127,7 +127,7 @@ def agreed_image(run: Run, fused: Restoration, deblurred: Deblurred, halves: Hal
     pairs = halves.alternate, halves.lasting
     sharp = [Halves(sharpened(pair.first), sharpened(pair.second)) for pair in pairs]
     mean = halves.alternate.mean
-    return keep_agreed(done.image, mean, halves.noise(), sharp, run.prepared.levels.full_scale)
+    return keep_agreed(done.image, mean, halves.alternate.noise(), sharp, run.prepared.levels.full_scale)
 
 
 def measure_photon_noise(run: Run, halves: Halves) -> NoiseCurve | None:

@@ -327,7 +327,7 @@ def _to_filtered(at: _Position, settings: PassSettings) -> Filtered:
         image_noise=settings.statistics.image_noise,
         sharpness_weight=settings.sharpness_weight,
         # The mean square of weights exp(β z), with z normal of variance v, over the square of their mean.
-        noise_gain=float(np.exp(settings.sharpness_weight**2 * store(settings.statistics.score_variance)).mean()),
+        noise_gain=float(np.exp(settings.sharpness_weight**2 * store(settings.statistics.score_variance).mean())),
         mean_flow=mean_flow,
     )
 

@@ -82,13 +82,6 @@ class HalvedClip:
         moved = (Halves(*(recentre(half, mean_flow) for half in pair)) for pair in pairs)
         return HalvedClip(next(moved), next(moved), self.count)
 
-    def noise(self) -> NoiseSpectrum:
-        """Spectrum of the noise of the mean: at every frequency, that of the halves that differ more."""
-        one, other = self.alternate.noise(), self.lasting.noise()
-        larger = one.power >= other.power
-        pairs = ((one.power, other.power), (one.error, other.error), (one.relative, other.relative))
-        return NoiseSpectrum(*(np.where(larger, *pair) for pair in pairs))
-
 
 def halve(
     frames: Iterable[FloatArray], flows: Iterable[FloatArray], shape: tuple[int, ...], count: int, threads: int = 0
