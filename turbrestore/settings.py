@@ -16,6 +16,7 @@ from .filtering.alternating import FilterParams
 from .footage.frame_selection import Share, check_share
 from .registration.centroid import CentroidParams
 from .registration.flow import FlowParams
+from .registration.opencv_flow import DisParams
 from .seeing.tilt_theory import Optics, known_optics
 
 STAGES = ("centroid", "identify", "filter", "deconvolve")
@@ -175,7 +176,11 @@ class RestoreParams:
 # this project's flow; there the width of the blur is chosen by hand, and here it is estimated where none is given.
 PRESETS: Mapping[Preset, RestoreParams] = MappingProxyType(
     {
-        "fast": RestoreParams(centroid=CentroidParams(iterations=2), filter=FilterParams(inner_iterations=1)),
+        "fast": RestoreParams(
+            flow=FlowParams(dis=DisParams(finest_scale=2)),
+            centroid=CentroidParams(iterations=2),
+            filter=FilterParams(inner_iterations=1),
+        ),
         "standard": RestoreParams(),
         "paper": RestoreParams(
             static_mask="off",
