@@ -178,10 +178,10 @@ def test_a_flow_from_a_good_start_errs_by_hardly_more_than_one_from_none(method,
 
 
 def test_a_flow_begins_at_its_start():
-    """Nothing brings a flow back that starts beyond the reach of the steps."""
+    """Nothing brings a flow back that starts beyond the reach of the search."""
     params = FlowParams(global_shift=False, confidence=False)
     image, errors = texture(size=160), []
-    for start in (10.5, 22):
+    for start in (10.5, 34):
         flows = np.full((1, 160, 160, 2), (start, 0), np.float32)
         flows = measure(prepare_reference(image, params), [np.roll(image, 10, axis=1)], flows)
         errors.append(float(np.abs(flows[0, 40:-40, 40:-40, 0] - 10).mean()))
