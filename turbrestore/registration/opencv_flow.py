@@ -1,8 +1,8 @@
 """The two flow methods that come from OpenCV: dense inverse search and Farneback's polynomial expansion.
 
 Dense inverse search with variational refinement (Kroeger et al. 2016) is the default method of
-:mod:`turbrestore.registration.flow`.  It ends at a quarter of the resolution, where it takes a twentieth of the time,
-because displacements of air are smooth over ten pixels; steps at full resolution
+:mod:`turbrestore.registration.flow`.  It ends at half the resolution, where it takes an eighth of the time, because
+displacements of air are smooth over ten pixels; steps at full resolution
 (:mod:`turbrestore.registration.refinement_step`) find what is left.  Farneback's method (2003) takes no start.
 """
 
@@ -22,6 +22,8 @@ GreyImage = NDArray[np.uint8]
 # Takes frames (B, H, W), the flow that each starts from, or None, and whether drafts will do; returns flows
 # (B, H, W, 2).  Threads share a solver.
 FlowSolver = Callable[[GreyImage, list[FloatArray | None], bool], FloatArray]
+# Lines above which the flow of air is smooth over so many pixels that a quarter of the resolution will do.
+_LARGE = 1000
 # Level, above the finest, at which a search that has a start begins.
 _LEVELS_FROM_START = 1
 
@@ -32,8 +34,9 @@ class DisParams:
 
     Parameters
     ----------
-    finest_scale : int
-        Pyramid level at which the search ends: 0 is full resolution, 1 half of it, and so on.
+    finest_scale : int, optional
+        Pyramid level at which the search ends: 0 is full resolution, 1 half of it, and so on.  By default 1, and 2 for
+        frames of more than 1,000 lines.
     patch_size : int
         Side of the matched patches, pixels of that level.
     patch_stride : int
@@ -44,14 +47,15 @@ class DisParams:
         Weight of the smoothness term in the refinement.
     """
 
-    finest_scale: int = 2
+    finest_scale: int | None = None
     patch_size: int = 8
-    patch_stride: int = 3
-    refinements: int = 4
+    patch_stride: int = 4
+    refinements: int = 2
     smoothness: float = 6.0
 
     def __post_init__(self) -> None:
-        require(0 <= self.finest_scale <= 4, f"finest_scale: expected 0 to 4, found {self.finest_scale}")
+        if self.finest_scale is not None:
+            require(0 <= self.finest_scale <= 4, f"finest_scale: expected 0 to 4, found {self.finest_scale}")
         require(4 <= self.patch_size <= 32, f"patch_size: expected 4 to 32 pixels, found {self.patch_size}")
         require(
             1 <= self.patch_stride <= self.patch_size,
@@ -92,6 +96,8 @@ class FarnebackParams:
 def dis_solver(params: DisParams, reference: GreyImage) -> FlowSolver:
     """Prepare dense inverse search from a reference (H, W); a start is a guess, near which the search begins."""
     finest = params.finest_scale
+    if finest is None:
+        finest = 1 if min(reference.shape) <= _LARGE else 2
 
     def solve(frame: GreyImage, start: FloatArray | None) -> FloatArray:
         # A solver object keeps buffers that threads must not share; making one is cheap beside a flow.

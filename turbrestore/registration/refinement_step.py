@@ -15,9 +15,9 @@ The gradient is that of the reference (Baker and Matthews 2004), so J is compute
 sharper than the reference, and the part of e that no displacement explains is large then: ε keeps steps from following
 it.  No component of δ exceeds one pixel, beyond which the linear model says nothing.
 
-A flow that is smooth over the window needs no search at full resolution: it is searched for at a quarter of the
-resolution, and steps find the rest.  Residuals are those of all pixels, but as a window averages over several, averages
-and flow lie on a grid of half the resolution.
+A flow that is smooth over the window needs no search at full resolution: it is searched for at half the resolution, and
+steps find the rest.  Residuals are those of all pixels, but as a window averages over several, averages and flow lie on
+a grid of half the resolution.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ GreyImage = NDArray[np.uint8]
 RefineFlow = Callable[[GreyImage, FloatArray], FloatArray]
 # Standard deviation of the window, pixels: narrower ones follow noise and what a blurred reference lacks.
 _WINDOW = 3.0
-# τ, pixels: what a search at a quarter of the resolution leaves.
+# τ, pixels: what a search at half the resolution leaves.
 _LEFT = 0.2
 # Least ε, squared grey levels per squared pixel: below one grey level a pixel, a gradient is rounding.
 _LEAST_TEXTURE = 1.0
