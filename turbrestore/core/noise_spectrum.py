@@ -98,12 +98,20 @@ def window_powers(image: FloatArray) -> Float64Array:
     profile = np.outer(profile, profile)
     starts = (_starts(length, side) for length in image.shape)
     every = np.lib.stride_tricks.sliding_window_view(image, (side, side))[np.ix_(*starts)].reshape(-1, side, side)
-    tapered = (every - every.mean(axis=(1, 2), keepdims=True)) * profile
-    power = np.square(np.abs(np.fft.fft2(tapered))).reshape(len(tapered), -1) / np.square(profile).sum()
-    nu = np.fft.fftfreq(side)
-    ring = np.minimum(np.rint(np.hypot(nu[:, None], nu) * SIDE), SIDE // 2).astype(int).ravel()
-    present = np.unique(ring)
-    means = np.stack([power[:, ring == number].mean(axis=1) for number in present], axis=1)
+    tapered = ((every - every.mean(axis=(1, 2), keepdims=True)) * profile).astype(np.float32, copy=False)
+    # NumPy computes in single precision only where it divides by the size.
+    spectra = np.fft.rfft2(tapered, norm="forward")
+    power = np.square(np.abs(spectra)).reshape(len(tapered), -1) * (side**4 / np.square(profile).sum())
+    frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side))
+    ring = np.minimum(np.rint(frequency * SIDE), SIDE // 2).astype(int).ravel()
+    # All columns but the first and, of an even number, the last stand for two.
+    times = np.full(frequency.shape, 2.0)
+    times[:, 0] = 1
+    times[:, -1] = 1 + side % 2
+    sums = np.zeros((ring.size, len(RINGS)))
+    sums[np.arange(ring.size), ring] = times.ravel()
+    present = np.flatnonzero(sums.any(axis=0))
+    means = power @ (sums / np.maximum(sums.sum(axis=0), 1))[:, present]
     # Small images have no frequencies in some rings.
     return np.array([np.interp(RINGS, RINGS[present], row) for row in means])
 
