@@ -95,7 +95,7 @@ def test_flows_of_another_recording_are_applied_as_they_are(run, folder, monkeyp
     code, _, err = run("restore", "second.npy", "p.tif", "--like", "part", *QUICK)
     assert (code, "register CLIP OUT --keep part --resume --flows" in err) == (65, True)
     part = command(run, folder, "restore", "second.npy", "p.tif", "--like", "f.npz")
-    assert distance(geometry(part, scenes["blue"]), geometry(np.load("g.npy").mean(axis=0), scenes["green"])) <= 0.08
+    assert distance(geometry(part, scenes["blue"]), geometry(np.load("g.npy").mean(axis=0), scenes["green"])) <= 0.09
     code, _, err = run("restore", "second.npy", "q.tif", "--like", "f.npz", "--frames", "0:10", *QUICK)
     assert code == 0, err
 

@@ -55,9 +55,9 @@ class NoiseSpectrum:
         return np.interp(frequency, RINGS, self.power)
 
     @property
-    def certain(self) -> Float64Array:
-        """N less two standard errors, (rings,): of scenes without flat parts, hardly anything."""
-        return np.maximum(self.power - 2 * self.error, 0.0)
+    def certain(self) -> NoiseSpectrum:
+        """N less two standard errors: hardly anything where a scene has no flat parts."""
+        return NoiseSpectrum(np.maximum(self.power - 2 * self.error, _LEAST), self.error, self.relative)
 
     def scaled(self, factor: float) -> NoiseSpectrum:
         """Return the spectrum of the same noise with its variance multiplied."""
@@ -76,8 +76,8 @@ def fit_noise_spectrum(differences: Iterable[FloatArray], scene: FloatArray) -> 
     powers = [window_powers(difference) for difference in differences]
     usual = np.quantile(np.array(powers), _QUARTILE, axis=0) / _quartile_of_noise(len(powers))
     found = np.array([_fit_ring(ring, m) for ring, m in zip(usual.T, of_scene.T, strict=True)])
-    # The mean of each window is taken out, which leaves half of the lowest ring.
-    found[0] = found[1]
+    # The mean of each window is taken out, and what changes as slowly as windows are wide is light.
+    found[:2] = found[2]
     return NoiseSpectrum(*np.maximum(found.T, [[_LEAST], [0.0], [0.0]]))
 
 

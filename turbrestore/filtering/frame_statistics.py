@@ -99,7 +99,7 @@ def measure_frame_statistics(
     sensor_noise = fit_noise_curve(mean, np.where(covered, variance, fine), energy).variance(mean)
     mean_frame, deviation, moments = _without_outliers(frames, flows, mean, variance, template, window, threads)
     noise = noise_of_frames(frames, flows, mean_frame)
-    coloured = _coloured(template, noise)
+    coloured = _coloured(template, noise.certain)
     sharpness, spread, explained, left_out = _leave_middle_out(moments, coloured, sensor_noise, window)
     scale = _score_scale(sharpness, spread, explained)
     weight = _sharpness_weight(sharpness, spread - explained, scale**2 * spread, float(sensor_noise.mean()) / count)

@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray, luminance
-from ...core.noise_spectrum import RINGS as NOISE_RINGS
 from ...core.noise_spectrum import NoiseSpectrum
 from ...registration.warp import sample_splines
 from ...runtime.image_stacks import spline_planes
@@ -115,7 +114,7 @@ def measure_variation(
         return None
     response = np.mean(responses, axis=0)
     # Means of pixels keep the power of the noise for each area, and spectra here are not normalised.
-    smooth_noise = np.interp(RINGS / reduction, NOISE_RINGS, noise.certain) / reduction**2 * np.square(_profile()).sum()
+    smooth_noise = noise.certain.at(RINGS / reduction) / reduction**2 * np.square(_profile()).sum()
     white_noise = response * float(np.median((np.mean(sums, axis=0)[0] / response)[-_NOISE_RINGS:]))
     power = np.maximum(np.maximum(white_noise, smooth_noise), _LEAST_NOISE)
     return _ratios(np.array(sums), power, len(picked), float(np.mean(stretches)), reduction)
