@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
@@ -168,6 +167,8 @@ def _white_part(image: FloatArray) -> FloatArray:
     if image.ndim == 3:
         return np.stack([_white_part(image[..., channel]) for channel in range(3)], axis=-1)
     # The cosine transform continues an image by its reflection, and keeps white noise white.
+    import scipy.fft
+
     spectrum = scipy.fft.dctn(image, norm="ortho")
     height, width = image.shape
     frequency = np.hypot(np.arange(height)[:, None] / (2 * height), np.arange(width) / (2 * width))
