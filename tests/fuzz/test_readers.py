@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from turbrestore.blur.estimation import BlurEstimate
 from turbrestore.blur.posterior import BlurWitnesses, blur_posterior
 from turbrestore.core.errors import TurbrestoreError
+from turbrestore.core.noise_spectrum import fit_noise_spectrum
 from turbrestore.deconvolution.deconvolve import Deconvolution, DeconvolutionParams, deconvolve
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
 from turbrestore.dynamics.flow_model import FlowDynamics
@@ -54,6 +55,7 @@ def make_results():
         "deconvolution": deconvolve(CLIP[0], 1.0, DeconvolutionParams(method="tv", iterations=5)),
         "blur": BlurEstimate(1.0, 0.1, 5 / 3, 0.01, 1, 9.0, np.arange(3.0), np.ones(3)),
         "posterior": blur_posterior(None, BlurWitnesses(1.0, 9.0)),
+        "noise": fit_noise_spectrum([CLIP[1] - CLIP[0]], CLIP[0]),
     }
 
 

@@ -34,9 +34,9 @@ class DisParams:
 
     Parameters
     ----------
-    finest_scale : int, optional
-        Pyramid level at which the search ends: 0 is full resolution, 1 half of it, and so on.  By default 1, and 2 for
-        frames of more than 1,000 lines.
+    finest_scale : int
+        Pyramid level at which the search ends: 0 is full resolution, 1 half of it, and so on; one level more for frames
+        of more than 1,000 lines.
     patch_size : int
         Side of the matched patches, pixels of that level.
     patch_stride : int
@@ -47,15 +47,14 @@ class DisParams:
         Weight of the smoothness term in the refinement.
     """
 
-    finest_scale: int | None = None
+    finest_scale: int = 1
     patch_size: int = 8
     patch_stride: int = 4
     refinements: int = 2
     smoothness: float = 6.0
 
     def __post_init__(self) -> None:
-        if self.finest_scale is not None:
-            require(0 <= self.finest_scale <= 4, f"finest_scale: expected 0 to 4, found {self.finest_scale}")
+        require(0 <= self.finest_scale <= 4, f"finest_scale: expected 0 to 4, found {self.finest_scale}")
         require(4 <= self.patch_size <= 32, f"patch_size: expected 4 to 32 pixels, found {self.patch_size}")
         require(
             1 <= self.patch_stride <= self.patch_size,
@@ -95,9 +94,7 @@ class FarnebackParams:
 
 def dis_solver(params: DisParams, reference: GreyImage) -> FlowSolver:
     """Prepare dense inverse search from a reference (H, W); a start is a guess, near which the search begins."""
-    finest = params.finest_scale
-    if finest is None:
-        finest = 1 if min(reference.shape) <= _LARGE else 2
+    finest = params.finest_scale + (min(reference.shape) > _LARGE)
 
     def solve(frame: GreyImage, start: FloatArray | None) -> FloatArray:
         # A solver object keeps buffers that threads must not share; making one is cheap beside a flow.

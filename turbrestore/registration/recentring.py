@@ -67,8 +67,8 @@ def recentre(image: ArrayLike, mean_flow: ArrayLike) -> FloatArray:
     --------
     >>> import numpy as np
     >>> ramp = np.tile(np.linspace(0, 1, 11, dtype=np.float32), (8, 1))
-    >>> float(recentre(ramp, np.full((8, 11, 2), [1.0, 0.0]))[4, 5])
-    0.4000000059604645
+    >>> round(float(recentre(ramp, np.full((8, 11, 2), [1.0, 0.0]))[4, 5]), 3)
+    0.4
     """
     V = recentring_flow(mean_flow)
     # Interpolation by no shift would change the last bits.
