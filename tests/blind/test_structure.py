@@ -84,7 +84,7 @@ def test_a_scene_that_changes_is_named_and_the_mean_is_the_result_where_registra
     steady, changing = StructureReading(0.0, 1.0, LASTING / 2), StructureReading(0.0, 1.0, 2 * LASTING)
     assert steady.explained and not changing.explained
     (decision,) = explain_structure(changing)
-    assert decision.subject == "structure" and "--frames" in decision.reason
+    assert decision.subject == "structure" and "changes" in decision.reason
     (decision,) = explain_structure(StructureReading(0.0, LEFT / 2, 2 * LASTING))
     assert decision.choice == "no blur is removed"
 
