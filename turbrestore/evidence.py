@@ -56,7 +56,7 @@ def evidence_of_frames(
         # The flows start from the geometry of the centroid.
         image = warp(image, invert_flow(recentring_flow(mean_flow)))
     halves = halve(training, flows, training.shape[1:], len(training), run.plan.runtime.threads)
-    new, lasting = halves.alternate.noise().deviation ** 2, halves.lasting.noise().deviation ** 2
+    new, lasting = halves.alternate.noise().deviation ** 2, halves.lasting.noise().certain.deviation ** 2
     structure = compare_structure(image, training, flows, len(training) * new, max(lasting - new, 0.0))
     run.decide(*explain_structure(structure))
     fused = replace(fused, structure=structure, is_mean=not structure.explained)
