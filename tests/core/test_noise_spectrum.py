@@ -65,3 +65,11 @@ def test_the_deviation_is_that_of_a_pixel():
     assert flat.deviation == pytest.approx(0.02)
     assert flat.scaled(0.25).deviation == pytest.approx(0.01)
     np.testing.assert_allclose(flat.at(np.array([0.0, 0.3, 0.7])), 4e-4)
+
+
+def test_nothing_is_certain_where_windows_are_few():
+    one, many = (
+        fit_noise_spectrum([noise(shape=(side, side))], np.zeros((side, side), np.float32)) for side in (32, 96)
+    )
+    assert one.certain.deviation < 1e-3 * one.deviation
+    assert many.certain.deviation > 0.8 * many.deviation

@@ -141,5 +141,7 @@ def _fit_ring(difference: Float64Array, scene: Float64Array) -> tuple[float, flo
         elif relative < 0:
             noise, relative = of_noise / one, 0.0
     residual = np.sqrt(weights) * (difference - noise - relative * scene)
-    error = np.sqrt(np.square(residual).mean() * spread)
+    # One or two windows fit any line, and tell no error.
+    left = len(difference) - 2
+    error = np.sqrt(np.square(residual).sum() / left * spread) if left > 0 else noise
     return float(noise), float(error), float(min(relative, 1.0))
