@@ -60,7 +60,7 @@ CASES = {
     "one frame without texture": (without_texture, "blank frames", "frame 5 left out"),
     "saturated parts": (saturated, "saturation", "left as it is"),
     "white frames": (white_frames, "blank frames", "frames 4, 7 left out"),
-    "motion of a fifth of the image": (far, "motion", "taken as measured"),
+    "a camera that moves by a fifth of the image": (far, "camera", "followed over"),
     "16 by 16 pixels": (lambda: USUAL.frames[:6, 10:26, 10:26], "blur", "removed"),
 }
 

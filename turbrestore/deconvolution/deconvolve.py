@@ -348,11 +348,15 @@ def _sharpened(
 def _noise_and_fidelity(
     planes: list[FloatArray], params: DeconvolutionParams, sigma: float, spectrum: NoiseSpectrum | None
 ) -> tuple[float, float]:
-    """Noise that the deconvolution meets, and λ: of smooth noise, what there is where the blur passes one half."""
-    if spectrum is None:
-        noise = float(np.sqrt(np.mean([estimate_noise(plane) ** 2 for plane in planes])))
-    else:
-        noise = spectrum.deviation if sigma == 0 else float(spectrum.at(np.array(half_frequency(sigma))) ** 0.5)
+    """Noise that the deconvolution meets, and λ.
+
+    Second differences tell white noise.  Of smooth noise, what there certainly is where the blur passes one half counts.
+    """
+    noise = float(np.sqrt(np.mean([estimate_noise(plane) ** 2 for plane in planes])))
+    if spectrum is not None:
+        known = spectrum.certain
+        smooth = known.deviation if sigma == 0 else float(known.at(np.array(half_frequency(sigma)))) ** 0.5
+        noise = max(noise, smooth)
     return noise, params.fidelity or automatic_fidelity(params.method, planes[0], noise)
 
 
