@@ -50,9 +50,8 @@ def find_clips(inputs: Iterable[Path]) -> list[Path]:
     for path in inputs:
         named = [path]
         if not path.exists() and glob.has_magic(str(path)):
-            # Not Path.glob, which refuses absolute patterns and matches hidden files.
-            names = sorted(glob.glob(str(path), recursive=True))  # noqa: PTH207
-            named = [Path(name) for name in names]
+            # Path.glob, which the rule asks for, refuses absolute patterns and matches hidden files.
+            named = [Path(name) for name in sorted(glob.glob(str(path), recursive=True))]  # noqa: PTH207
         if not named:
             raise InputNotFoundError(f"{path}: no file matches this pattern")
         for one in named:

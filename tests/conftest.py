@@ -33,7 +33,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 @pytest.fixture(scope="module")
 def browser():
     if CHROMIUM is None:
-        # A browser is no Python package: the extra `dev` cannot bring it.
+        # A browser is no Python package, so the extra `dev` cannot install it; .ci/run does.
         pytest.skip("no Chromium on the path; install chromium to test pages in a browser")
     from playwright.sync_api import sync_playwright
 

@@ -105,9 +105,8 @@ def test_in_the_window(clip, monkeypatch, request):
     qtbot = request.getfixturevalue("qtbot")
     from qtpy.QtGui import QOpenGLContext
 
-    # The offscreen platform of Qt draws with OpenGL only where the system has a driver for it, and an X server, such as
-    # that of xvfb-run.
     if not QOpenGLContext().create():
+        # Drivers of OpenGL and an X server (xvfb-run) belong to the system; no Python package brings them.
         pytest.skip("Qt has no OpenGL here, which the window of napari draws with")
     viewer = request.getfixturevalue("make_napari_viewer")()
     viewer.open(str(clip), plugin="turbrestore")

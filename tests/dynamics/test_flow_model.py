@@ -106,7 +106,7 @@ def test_a_flow_is_projected_as_the_plain_loop_does(rng, shape, rank, order):
     assert found == pytest.approx(flow.reshape(-1).astype(np.float64) @ modes.astype(np.float64), abs=1e-4)
 
 
-# Pages of a mapped file that are resident are counted by the system alone, and only Linux tells them.
+# This folder is tested on macOS and Windows too, and only Linux tells which pages of a mapped file are in memory.
 @pytest.mark.skipif(not STATM.exists(), reason="memory is read from /proc")
 @pytest.mark.parametrize(("count", "shape"), [(80, (256, 512)), (2, (2048, 2560))])
 def test_a_state_takes_a_piece_of_the_modes_at_a_time(tmp_path, count, shape):

@@ -1,6 +1,5 @@
 """Videos as cameras record them: turned, in any container, with pixels that are not square, begun in the middle."""
 
-import os
 from pathlib import Path
 
 import av
@@ -125,5 +124,5 @@ def test_elementary_streams_have_all_their_frames(tmp_path, suffix, codec):
 def test_the_content_counts_where_the_suffix_lies(tmp_path, true, named):
     frames = np.float32(FRAMES)[..., 0] / 255
     write_video(tmp_path / f"a{true}", frames, 25)
-    os.replace(tmp_path / f"a{true}", tmp_path / named)  # noqa: PTH105
+    (tmp_path / f"a{true}").replace(tmp_path / named)
     np.testing.assert_array_equal(open_frames(tmp_path / named).read(), frames)

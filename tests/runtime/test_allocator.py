@@ -30,7 +30,7 @@ def test_the_allocator_gets_its_setting_back_after_an_error(monkeypatch):
     assert calls == []
 
 
-# Other allocators return freed memory by rules of their own, which the package does not set.
+# Only the allocator of glibc is told when to return memory; others, as on macOS, follow rules of their own.
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the allocator is another one than glibc's")
 def test_arrays_that_are_freed_go_back_to_the_system():
     code = """

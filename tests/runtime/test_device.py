@@ -91,6 +91,8 @@ class TestChoice:
         assert bool(asked_for) is needs_torch("auto") is asked
 
     @NO_TORCH
+    # Without a library only Linux tells a process the most memory that it has taken since it began.
+    @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory is read from /proc")
     def test_memory_that_torch_takes_is_known(self):
         script = """
             import re, numpy, cv2, scipy
@@ -103,9 +105,6 @@ class TestChoice:
             float(torch.fft.rfft2(torch.ones(64, 64)).abs().sum(dtype=torch.float64))
             print(most() - before, torch.version.cuda or torch.version.hip or "")
         """
-        # Only Linux tells a process the most memory that it has taken since it began, without a library.
-        if not Path("/proc/self/status").exists():
-            pytest.skip("the system does not say how much memory a process takes")
         words = [sys.executable, "-c", textwrap.dedent(script)]
         taken, *build = subprocess.run(words, capture_output=True, text=True, check=True).stdout.split()
         assert int(taken) > 0.5 * TORCH_BYTES
