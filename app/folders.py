@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from turbrestore.core.errors import ConfigurationError
-from turbrestore.io.images import IMAGE_SUFFIXES
+from turbrestore.io.images.image_files import IMAGE_SUFFIXES
 from turbrestore.io.limits import input_errors
 from turbrestore.io.video import VIDEO_SUFFIXES
 

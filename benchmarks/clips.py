@@ -24,7 +24,7 @@ from blur_clips import REPORTED, Case, behind_air, behind_lens
 import turbrestore
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import InputNotFoundError
-from turbrestore.io.images import read_image
+from turbrestore.io.images.image_files import read_image
 from turbrestore.io.video import open_frames
 from turbrestore.synthesis.anisoplanatic import phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams

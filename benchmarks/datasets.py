@@ -48,7 +48,7 @@ from words import can_read, share_read
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import DataError, InputNotFoundError, OutputError, TurbrestoreError
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.output import atomic_write
 from turbrestore.io.video import VIDEO_SUFFIXES, open_frames
 from turbrestore.metrics import appearance, psnr

@@ -31,7 +31,7 @@ from turbrestore.filtering.alternating import FilterParams, filter_frames
 from turbrestore.metrics import psnr
 from turbrestore.pipeline import restore
 from turbrestore.registration.flow import FlowParams, estimate_flow
-from turbrestore.registration.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
+from turbrestore.registration.flow_methods.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
 from turbrestore.runtime.device import CPU, find_device
 from turbrestore.runtime.image_stacks import load, store

@@ -18,7 +18,7 @@ from provenance import publish_printed
 from turbrestore.core.arrays import FloatArray
 from turbrestore.dynamics.dynamic_texture import identify
 from turbrestore.filtering.alternating import FilterParams, filter_frames
-from turbrestore.io.images import read_image
+from turbrestore.io.images.image_files import read_image
 from turbrestore.io.video import open_frames
 from turbrestore.memory_plan import training_share
 from turbrestore.metrics import compare

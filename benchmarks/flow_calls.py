@@ -34,7 +34,7 @@ from turbrestore.metrics import compare
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import CentroidParams
 from turbrestore.registration.flow import FlowParams, iterate_flows
-from turbrestore.registration.opencv_flow import DisParams
+from turbrestore.registration.flow_methods.opencv_flow import DisParams
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.settings import preset
 

@@ -29,7 +29,7 @@ from hostile_content import CONTENT, Content
 from hostile_files import BOMBS, FLIPPED, FORMATS, STILLS, flipped, flipped_still, malformed, write_clip, write_still
 
 from turbrestore.core.errors import DataError
-from turbrestore.io.images import read_image
+from turbrestore.io.images.image_files import read_image
 from turbrestore_cli.__main__ import main as command_line
 
 BAD_DATA, DONE = 65, 0

@@ -19,7 +19,7 @@ import numpy as np
 from clips import data_folder, find_clips
 
 from turbrestore.core.arrays import FloatArray, luminance
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.video import open_frames
 from turbrestore.pipeline import Restoration, restore
 

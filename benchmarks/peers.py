@@ -37,7 +37,7 @@ from turbrestore.blind.remove_blur import remove_blur
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import TurbrestoreError
 from turbrestore.footage.frame_selection import best_frames, frame_quality
-from turbrestore.io.images import write_image
+from turbrestore.io.images.image_files import write_image
 from turbrestore.io.output import atomic_write
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore

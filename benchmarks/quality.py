@@ -35,7 +35,7 @@ from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import TurbrestoreError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.filtering.alternating import FilterParams
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.output import atomic_write
 from turbrestore.io.video import open_frames
 from turbrestore.metrics import appearance, compare

@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from turbrestore.core.arrays import FloatArray, luminance
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
 from turbrestore.pipeline import restore

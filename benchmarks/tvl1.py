@@ -37,8 +37,8 @@ from turbrestore.dynamics.dynamic_texture import identify
 from turbrestore.dynamics.flow_model import predict_flow, project_deviation
 from turbrestore.metrics import endpoint_error
 from turbrestore.registration.flow import FlowParams, iterate_flows, normalise_contrast
-from turbrestore.registration.opencv_flow import FlowSolver, GreyImage
-from turbrestore.registration.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
+from turbrestore.registration.flow_methods.opencv_flow import FlowSolver, GreyImage
+from turbrestore.registration.flow_methods.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.threads import map_ahead
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from turbrestore.core.arrays import FloatArray, luminance
-from turbrestore.io.images import read_image
+from turbrestore.io.images.image_files import read_image
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames
 from turbrestore.pipeline import restore

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from turbrestore.io.images import write_image
+from turbrestore.io.images.image_files import write_image
 from turbrestore.synthesis.scenes import resolution_chart
 
 COMMAND = [sys.executable, "-m", "turbrestore_cli"]

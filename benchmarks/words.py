@@ -27,7 +27,7 @@ import numpy as np
 from methods.packages import NETWORKS
 
 from turbrestore.core.arrays import FloatArray, from_unit, luminance
-from turbrestore.io.images import write_image
+from turbrestore.io.images.image_files import write_image
 
 ENLARGEMENT = 3
 # Page segmentation of tesseract: one uniform block, sparse text.

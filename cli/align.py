@@ -14,7 +14,7 @@ from turbrestore.core.arrays import FloatArray, luminance
 from turbrestore.core.errors import OutputError, TurbrestoreError, require
 from turbrestore.footage.frame_selection import frame_quality
 from turbrestore.io.folders import frame_files
-from turbrestore.io.images import IMAGE_SUFFIXES, ImageFile, read_image, write_image
+from turbrestore.io.images.image_files import IMAGE_SUFFIXES, ImageFile, read_image, write_image
 from turbrestore.io.output import IMAGE_OUTPUT_SUFFIXES, atomic_write, check_output
 from turbrestore.stacking.alignment import Alignment
 from turbrestore.stacking.results_alignment import AlignedResults, align_results, contact_sheet

@@ -11,7 +11,7 @@ from pathlib import Path
 from turbrestore.core.decision import Decision
 from turbrestore.core.errors import require
 from turbrestore.fusion import TileMap
-from turbrestore.io.images import write_map
+from turbrestore.io.images.image_files import write_map
 from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
 from turbrestore.io.source import FrameSource

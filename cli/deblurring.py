@@ -20,7 +20,7 @@ from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.deconvolution.deconvolve import deconvolve as deconvolve_image
 from turbrestore.display.figure import new_figure
 from turbrestore.display.maps import plot_images
-from turbrestore.io.images import read_image
+from turbrestore.io.images.image_files import read_image
 from turbrestore.io.limits import Limits
 from turbrestore.io.output import IMAGE_OUTPUT_SUFFIXES, check_output
 from turbrestore.io.pixels import check_depth

@@ -10,11 +10,11 @@ from turbrestore.core.errors import DataError, require
 from turbrestore.footage.checks.content import ContentParams, ContentReport, check_content, clean_source
 from turbrestore.io.astronomy.fits import open_fits
 from turbrestore.io.astronomy.fits_header import is_fits
-from turbrestore.io.images import IMAGE_SUFFIXES, read_image, read_pixels
+from turbrestore.io.images.image_files import IMAGE_SUFFIXES, read_image, read_pixels
+from turbrestore.io.images.tiff import TIFF_SUFFIXES
 from turbrestore.io.limits import Limits
 from turbrestore.io.npy import map_npy
 from turbrestore.io.source import FrameSource
-from turbrestore.io.tiff import TIFF_SUFFIXES
 from turbrestore.io.video import open_frames
 from turbrestore.memory_plan import training_share
 from turbrestore.runs.stage_files import load_guide, load_stage_image

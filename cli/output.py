@@ -20,7 +20,7 @@ from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import OutputError
 from turbrestore.io.astronomy.fits_header import is_fits
 from turbrestore.io.astronomy.fits_output import FITS_OUTPUT_SUFFIX, write_fits
-from turbrestore.io.images import write_image
+from turbrestore.io.images.image_files import write_image
 from turbrestore.io.output import atomic_write, check_output
 from turbrestore.io.source import FrameSource
 from turbrestore.metrics import compare

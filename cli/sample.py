@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from turbrestore.core.errors import OutputError
-from turbrestore.io.images import write_image
+from turbrestore.io.images.image_files import write_image
 from turbrestore.io.output import check_output
 from turbrestore.io.video import write_video
 from turbrestore.synthesis.sample import RATE, sample_clip

@@ -19,7 +19,7 @@ from turbrestore.dynamics.dynamic_texture import identify as identify_flows
 from turbrestore.dynamics.flow_model import FlowDynamics, predict_flow, project_deviation
 from turbrestore.dynamics.prediction import PredictionStudy, flow_error, study_prediction
 from turbrestore.filtering.alternating import Filtered, FilterParams, FilterStep, filter_steps
-from turbrestore.io.images import write_image
+from turbrestore.io.images.image_files import write_image
 from turbrestore.io.output import IMAGE_OUTPUT_SUFFIXES, check_output, check_space, size_text
 from turbrestore.io.source import FrameSource
 from turbrestore.registration.centroid import Centroid, CentroidParams, centroid_steps

@@ -20,7 +20,7 @@ from turbrestore import __version__
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import ConfigurationError, OutputError, require, require_between
 from turbrestore.core.remarks import counted
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.limits import Limits
 from turbrestore.io.output import check_output, check_space
 from turbrestore.io.video import VIDEO_OUTPUT_SUFFIXES, open_frames, write_video

@@ -14,7 +14,7 @@ from turbrestore.footage.checks.content import check_content
 from turbrestore.footage.levels import stretch_levels
 from turbrestore.footage.lighting.light import steady_light
 from turbrestore.footage.overlays import Title, _titles, read_static_mask, without_overlay
-from turbrestore.io.images import write_image
+from turbrestore.io.images.image_files import write_image
 from turbrestore.io.source import FrameSource
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore

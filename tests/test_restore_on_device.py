@@ -72,7 +72,7 @@ def test_frames_that_do_not_count(device):
 @pytest.mark.parametrize(
     ("place", "advice", "params"),
     [
-        ("registration.tvl1.tvl1_flows", "lower flow.tvl1.batch", RestoreParams(flow=TVL1)),
+        ("registration.flow_methods.tvl1.tvl1_flows", "lower flow.tvl1.batch", RestoreParams(flow=TVL1)),
         ("registration.warp.warp_stack", "process a smaller part .*", RestoreParams()),
         ("filtering.frame_noise.warp_stack", "process a smaller part .*", RestoreParams(filter=FilterParams())),
     ],

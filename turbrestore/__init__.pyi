@@ -24,8 +24,8 @@ from .footage.checks.content import clean_source as clean_source
 from .footage.checks.scene_cuts import Scene as Scene
 from .footage.object_crop import crop_to_object as crop_to_object
 from .io.containers.stream import live_frames as live_frames
-from .io.images import read_image as read_image
-from .io.images import write_image as write_image
+from .io.images.image_files import read_image as read_image
+from .io.images.image_files import write_image as write_image
 from .io.limits import Limits as Limits
 from .io.source import FrameSource as FrameSource
 from .io.video import open_frames as open_frames

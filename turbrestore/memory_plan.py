@@ -34,7 +34,7 @@ from .dynamics.dynamic_texture import identify_memory, modes_memory
 from .filtering.filter_records import filter_memory
 from .footage.survey import survey_memory, survey_scratch_bytes
 from .registration.flow import MIN_SIDE
-from .registration.opencv_flow import flow_memory
+from .registration.flow_methods.opencv_flow import flow_memory
 from .registration.registered_noise import halves_memory
 from .runtime.device import TORCH_BYTES, find_device, needs_torch
 from .runtime.jit import COMPILER_BYTES

@@ -22,7 +22,7 @@ from .evidence import Evidence, agreed_image, evidence_of_frames, measure_photon
 from .footage.checks.content import without_blank
 from .footage.levels import Levels
 from .fusion import Run, TileMap, added_up, centroid_stage, filter_stage, finish_mean, read_training
-from .io.images import read_image
+from .io.images.image_files import read_image
 from .io.output import check_space
 from .io.source import FrameSource
 from .memory_plan import plan_memory

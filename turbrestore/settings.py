@@ -16,7 +16,7 @@ from .filtering.alternating import FilterParams
 from .footage.frame_selection import Share, check_share
 from .registration.centroid import CentroidParams
 from .registration.flow import FlowParams
-from .registration.opencv_flow import DisParams
+from .registration.flow_methods.opencv_flow import DisParams
 from .seeing.tilt_theory import Optics, known_optics
 
 STAGES = ("centroid", "identify", "filter", "deconvolve")

@@ -17,7 +17,7 @@ import words
 from provenance import LINE, outdated, revision, with_origin
 
 import turbrestore
-from turbrestore.io.images import read_image
+from turbrestore.io.images.image_files import read_image
 from turbrestore.registration.warp import warp
 
 

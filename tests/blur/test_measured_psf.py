@@ -7,7 +7,7 @@ import pytest
 from turbrestore.blur.measured_psf import psf_from_image
 from turbrestore.core.errors import DataError
 from turbrestore.deconvolution.problem import read_blur
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore_cli.__main__ import main as run_command
 

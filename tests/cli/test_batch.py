@@ -18,7 +18,7 @@ import pytest
 
 from conftest import make_sequence
 from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError, TurbrestoreError
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.report.batch_page import ClipRow, render_batch
 from turbrestore.runtime.runtime import Runtime

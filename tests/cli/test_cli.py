@@ -12,7 +12,7 @@ import pytest
 from command_line import QUICK, QUICKEST, fails, frames_clip
 
 from conftest import make_sequence
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.pipeline import restore
 from turbrestore.registration.centroid import Centroid

@@ -15,7 +15,7 @@ from typing import get_args
 import pytest
 
 from turbrestore.core.errors import TurbrestoreError
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.pipeline import RestoreParams
 from turbrestore_cli import doctor

@@ -8,7 +8,7 @@ import pytest
 from command_line import QUICKEST, fails, frames_clip
 
 from conftest import make_sequence
-from turbrestore.io.images import write_image
+from turbrestore.io.images.image_files import write_image
 from turbrestore.io.video import write_video
 
 

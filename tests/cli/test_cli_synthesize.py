@@ -9,7 +9,7 @@ import pytest
 
 from conftest import make_sequence
 from turbrestore import __version__
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.metrics import psnr
 from turbrestore.registration.warp import warp

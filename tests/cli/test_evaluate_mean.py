@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from turbrestore.io.images import write_image
+from turbrestore.io.images.image_files import write_image
 from turbrestore.io.video import write_video
 from turbrestore.metrics import compare
 

@@ -7,7 +7,7 @@ from command_line import QUICK, fails
 from conftest import SCENES, blurred
 from turbrestore.blind.guards import GuardParams
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.runtime.runtime import DEFAULT
 from turbrestore_cli.deblurring import PART, contact_sheet, detailed_window
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from turbrestore.io.images import write_image
+from turbrestore.io.images.image_files import write_image
 from turbrestore_cli.__main__ import main
 
 USAGE, MISSING = 2, 66

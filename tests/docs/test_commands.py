@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.video import open_frames, write_video
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.commands import build

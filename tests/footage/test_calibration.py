@@ -8,7 +8,7 @@ from conftest import make_sequence
 from turbrestore.core.errors import DataError
 from turbrestore.footage.calibration import calibrated, make_calibration
 from turbrestore.footage.checks.content import check_content, clean_source
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video
 from turbrestore_cli.__main__ import main

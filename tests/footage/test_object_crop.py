@@ -6,7 +6,7 @@ import pytest
 
 from turbrestore.core.errors import DataError
 from turbrestore.footage.object_crop import crop_to_object, find_object
-from turbrestore.io.images import read_image
+from turbrestore.io.images.image_files import read_image
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
 from turbrestore_cli.__main__ import main

@@ -21,7 +21,7 @@ from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify
 from turbrestore.dynamics.flow_model import FlowDynamics
 from turbrestore.filtering.alternating import Filtered, FilterParams, filter_frames
 from turbrestore.footage.checks.content import check_content, clean_source
-from turbrestore.io.images import read_image
+from turbrestore.io.images.image_files import read_image
 from turbrestore.io.limits import Limits
 from turbrestore.io.npy import map_npy, read_npz
 from turbrestore.io.video import open_frames, write_video

@@ -11,7 +11,7 @@ import PIL.Image
 import pytest
 
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.io.images import read_image
+from turbrestore.io.images.image_files import read_image
 from turbrestore.io.limits import Limits
 from turbrestore.io.pixels import upright
 from turbrestore.io.video import open_frames

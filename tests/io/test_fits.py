@@ -14,7 +14,7 @@ from turbrestore.footage.calibration import calibrated, make_calibration
 from turbrestore.footage.checks.content import check_content, clean_source
 from turbrestore.io.astronomy.fits import open_fits
 from turbrestore.io.astronomy.fits_output import write_fits
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.limits import Limits
 from turbrestore.io.output import check_output
 from turbrestore.io.video import open_frames

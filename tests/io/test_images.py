@@ -22,7 +22,7 @@ from turbrestore.core.errors import (
     StorageError,
     TurbrestoreError,
 )
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.output import atomic_output, atomic_write, check_output
 from turbrestore.io.pixels import to_unit
 

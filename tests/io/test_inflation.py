@@ -11,8 +11,8 @@ import pytest
 import tifffile
 
 from turbrestore.core.errors import DataError
-from turbrestore.io.images import read_image
-from turbrestore.io.tiff import open_tiff
+from turbrestore.io.images.image_files import read_image
+from turbrestore.io.images.tiff import open_tiff
 
 
 class TestInflation:

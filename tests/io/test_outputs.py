@@ -15,7 +15,7 @@ from conftest import make_sequence
 from turbrestore.core.errors import OutputError, StorageError
 from turbrestore.filtering.estimates import Gaussian, PixelGaussian
 from turbrestore.filtering.filter_records import FilterCheckpoint, FilterState
-from turbrestore.io.images import write_image
+from turbrestore.io.images.image_files import write_image
 from turbrestore.io.output import atomic_write, check_output, check_space
 from turbrestore.io.video import VIDEO_OUTPUT_SUFFIXES, write_video
 from turbrestore.registration.centroid import Centroid

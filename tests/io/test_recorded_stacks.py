@@ -8,7 +8,7 @@ import tifffile
 
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.footage.checks.content import check_content
-from turbrestore.io.images import read_image, read_pixels
+from turbrestore.io.images.image_files import read_image, read_pixels
 from turbrestore.io.pixels import upright
 from turbrestore.io.video import open_frames, write_video
 from videos import refused, scene

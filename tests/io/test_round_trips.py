@@ -17,7 +17,7 @@ from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
 from turbrestore.filtering.alternating import Filtered, FilterParams
 from turbrestore.footage.frame_selection import Share
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.pipeline import Restoration, RestoreParams
 from turbrestore.registration.centroid import Centroid, CentroidParams

@@ -14,7 +14,7 @@ from turbrestore.footage.checks.content import check_content, clean_source
 from turbrestore.io.astronomy.fits_output import write_fits
 from turbrestore.io.counts import range_of_counts
 from turbrestore.io.folders import in_order
-from turbrestore.io.images import write_image
+from turbrestore.io.images.image_files import write_image
 from turbrestore.io.video import open_frames
 
 RNG = np.random.default_rng(6)

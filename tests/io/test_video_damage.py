@@ -18,7 +18,7 @@ from turbrestore.core.errors import (
     StorageError,
 )
 from turbrestore.io.containers.integrity import ffv1_slices_intact, is_cut_short
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.limits import Limits
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video

@@ -8,7 +8,7 @@ import pytest
 from turbrestore.core.errors import ConfigurationError
 from turbrestore.registration.centroid import CentroidParams, find_centroid
 from turbrestore.registration.flow import FlowParams, estimate_flow
-from turbrestore.registration.tvl1 import prepare_tvl1, tvl1_flows
+from turbrestore.registration.flow_methods.tvl1 import prepare_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.synthesis.scenes import SCENES

@@ -17,9 +17,9 @@ from turbrestore.registration.flow import (
     normalise_to_8_bits,
     prepare_reference,
 )
-from turbrestore.registration.opencv_flow import DisParams, FarnebackParams, dis_solver, flow_memory
-from turbrestore.registration.refinement_step import flow_refinement
-from turbrestore.registration.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
+from turbrestore.registration.flow_methods.opencv_flow import DisParams, FarnebackParams, dis_solver, flow_memory
+from turbrestore.registration.flow_methods.refinement_step import flow_refinement
+from turbrestore.registration.flow_methods.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from turbrestore.metrics import endpoint_error
-from turbrestore.registration import refinement_step
-from turbrestore.registration.refinement_step import flow_refinement, project_residual, step
+from turbrestore.registration.flow_methods import refinement_step
+from turbrestore.registration.flow_methods.refinement_step import flow_refinement, project_residual, step
 from turbrestore.registration.warp import warp
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
 

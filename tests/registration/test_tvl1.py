@@ -9,8 +9,8 @@ from torch_devices import NO_TORCH
 
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.registration.flow import FlowParams, estimate_flow
-from turbrestore.registration.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
-from turbrestore.registration.tvl1_sweeps import (
+from turbrestore.registration.flow_methods.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
+from turbrestore.registration.flow_methods.tvl1_sweeps import (
     FlowProblem,
     SweepParams,
     add_differences,

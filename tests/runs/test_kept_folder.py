@@ -11,7 +11,7 @@ import pytest
 
 from conftest import make_sequence
 from turbrestore.core.errors import DataError, OutputError
-from turbrestore.io.images import write_image
+from turbrestore.io.images.image_files import write_image
 from turbrestore.io.video import open_frames
 from turbrestore.runs.digests import content_digest
 from turbrestore.runs.folder_lock import LOCK, lock_folder
@@ -49,7 +49,6 @@ def whole(tmp_path_factory, frames):
 DYING = """
 import os, sys
 from turbrestore.runs import run_files, run_folder
-from turbrestore.io import images
 from turbrestore_cli.__main__ import main
 where = sys.argv.pop(1)
 real = run_folder.save_stage

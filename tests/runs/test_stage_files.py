@@ -11,7 +11,7 @@ from turbrestore.blur.estimation import BlurEstimate
 from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError, OutputError
 from turbrestore.deconvolution.deconvolve import Deconvolution
 from turbrestore.dynamics.flow_model import FlowDynamics
-from turbrestore.io.images import write_image
+from turbrestore.io.images.image_files import write_image
 from turbrestore.io.npy import write_npz
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.centroid import Centroid, CentroidParams

@@ -10,7 +10,7 @@ from command_line import fails
 
 from turbrestore.core.arrays import luminance
 from turbrestore.core.errors import DataError
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.registration.warp import sample_linear, warp
 from turbrestore.stacking.alignment import Alignment, align_to
 from turbrestore.stacking.results_alignment import align_results, contact_sheet

@@ -9,7 +9,7 @@ from scipy import fft
 
 from turbrestore.core.arrays import luminance
 from turbrestore.core.errors import ConfigurationError
-from turbrestore.io.images import read_image
+from turbrestore.io.images.image_files import read_image
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
 from turbrestore.pipeline import restore

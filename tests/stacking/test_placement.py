@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.io.images import read_image, write_image
+from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.video import write_video
 from turbrestore.pipeline import restore
 from turbrestore.registration.flow import estimate_flow

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from turbrestore.io.images import read_image
+from turbrestore.io.images.image_files import read_image
 from turbrestore.io.video import open_frames
 
 STORED = Path(__file__).parents[2] / "sample_data"

@@ -9,7 +9,7 @@ from turbrestore.blur.psf import blur_otf, laplacian_symbol
 from turbrestore.core.noise import estimate_noise
 from turbrestore.deconvolution.conjugate_gradient import wiener_fidelity
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, automatic_fidelity
-from turbrestore.io.images import write_image
+from turbrestore.io.images.image_files import write_image
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
 from turbrestore.synthesis.scenes import picture

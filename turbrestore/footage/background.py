@@ -37,7 +37,7 @@ from ..core.decision import Decision
 from ..core.robust import MEDIAN_DEVIATION, spread
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import known_shifts
-from ..registration.opencv_flow import DisParams, dis_solver
+from ..registration.flow_methods.opencv_flow import DisParams, dis_solver
 from ..runtime.scratch import iter_frames
 from .placement import Placement, reduce_frames, relative_window
 from .survey import Survey

@@ -34,7 +34,7 @@ from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..core.errors import DataError
 from ..core.gradient import sobel_gradient
-from ..io.images import read_image
+from ..io.images.image_files import read_image
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import known_shifts
 from .checks.missing_pixels import continued

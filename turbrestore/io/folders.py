@@ -12,11 +12,11 @@ from ..core.remarks import counted
 from .astronomy.fits import open_fits_folder
 from .astronomy.fits_header import FITS_SUFFIXES, is_fits
 from .counts import source_of_numbers
-from .images import IMAGE_SUFFIXES, read_pixels
+from .images.image_files import IMAGE_SUFFIXES, read_pixels
+from .images.raw_files import RAW_SUFFIXES
 from .limits import Limits, input_errors
 from .output import size_text
 from .pixels import PixelArray
-from .raw_files import RAW_SUFFIXES
 from .source import FrameSource
 
 # Number, dot and number, not within a longer chain such as a date.

@@ -33,14 +33,20 @@ from .astronomy.ser import open_ser, write_ser
 from .containers.decoding import CONTAINER_SUFFIXES, is_container, open_container
 from .containers.encoding import BY_SUFFIX, Encoding, Soundtrack, write_container
 from .folders import open_folder
-from .images import ANIMATION_OUTPUT_SUFFIXES, ANIMATION_SUFFIXES, IMAGE_SUFFIXES, open_animation, write_animation
+from .images.image_files import (
+    ANIMATION_OUTPUT_SUFFIXES,
+    ANIMATION_SUFFIXES,
+    IMAGE_SUFFIXES,
+    open_animation,
+    write_animation,
+)
+from .images.raw_files import RAW_SUFFIXES
+from .images.tiff import TIFF_SUFFIXES, open_tiff, write_tiff
 from .limits import DEFAULT_LIMITS, Limits, check_input, content_suffix, input_errors
 from .npy import open_npy, write_npy
 from .output import check_output
 from .pixels import BAYER_CODES, check_depth, demosaic, to_unit
-from .raw_files import RAW_SUFFIXES
 from .source import FrameRange, FrameSource, Roi, numbers_text, to_slice
-from .tiff import TIFF_SUFFIXES, open_tiff, write_tiff
 
 VIDEO_SUFFIXES = (*CONTAINER_SUFFIXES, ".ser", *TIFF_SUFFIXES, ".npy", *ANIMATION_SUFFIXES, *FITS_SUFFIXES)
 VIDEO_OUTPUT_SUFFIXES = (".mkv", ".mp4", ".ser", *TIFF_SUFFIXES, ".npy", *ANIMATION_OUTPUT_SUFFIXES)

@@ -4,9 +4,10 @@ The contract of every method: ``reference(x, y) ≈ frame(x + dx, y + dy)``, flo
 ``warp(frame, flow)`` lies on the reference (W_k of paper 3, eq. 6: ``I_k ∘ w_k = Kρ``).  A frame may bring a start: an
 earlier flow to it from a similar reference.
 
-The three methods are ``dis``, the default, and ``farneback`` (:mod:`turbrestore.registration.opencv_flow`), and
-``tvl1`` (:mod:`turbrestore.registration.tvl1`).  Paper 3 uses Black–Anandan flow, which these supersede.  One driver
-surrounds them all:
+The three methods are ``dis``, the default, and ``farneback``
+(:mod:`turbrestore.registration.flow_methods.opencv_flow`), and ``tvl1``
+(:mod:`turbrestore.registration.flow_methods.tvl1`).  Paper 3 uses Black–Anandan flow, which these supersede.  One
+driver surrounds them all:
 
 1. Local contrast is normalised (zero mean, unit deviation in a Gaussian window), so that dark and low-contrast regions
    register as well as bright ones; ``contrast_floor`` keeps noise in flat regions from being amplified.  If much of the
@@ -17,7 +18,7 @@ surrounds them all:
    Pixels beyond the edge of the shifted frame are filled from the reference, so that they move with the shift.  If a
    frame has a start that moves as a whole, the shift is taken from the start.
 3. The method measures the flow.  That of dense inverse search is refined by steps at full resolution
-   (:mod:`turbrestore.registration.refinement_step`).
+   (:mod:`turbrestore.registration.flow_methods.refinement_step`).
 4. Where the texture of the reference does not determine the motion, the flow is drawn towards its neighbourhood
    (:mod:`turbrestore.registration.confidence`), so that flat regions move as their surroundings do.
 """
@@ -42,9 +43,9 @@ from ..runtime.scratch import fill_frames, iter_frames, new_stack
 from ..runtime.threads import in_batches, map_ahead
 from .camera.global_shift import ShiftReference, frame_shift, prepare_shift_reference, shift_frame
 from .confidence import flow_confidence, noise_share, regularise_flow
-from .opencv_flow import DisParams, FarnebackParams, FlowSolver, GreyImage, dis_solver, farneback_solver
-from .refinement_step import RefineFlow, flow_refinement, half_grid
-from .tvl1 import TvL1Params, tvl1_solver
+from .flow_methods.opencv_flow import DisParams, FarnebackParams, FlowSolver, GreyImage, dis_solver, farneback_solver
+from .flow_methods.refinement_step import RefineFlow, flow_refinement, half_grid
+from .flow_methods.tvl1 import TvL1Params, tvl1_solver
 
 MIN_SIDE = 16
 # Grey levels for each local standard deviation: ±4 deviations fit into 8 bits.

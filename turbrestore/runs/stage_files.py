@@ -26,7 +26,7 @@ from ..deconvolution.deconvolve import Deconvolution
 from ..dynamics.flow_model import FlowDynamics
 from ..filtering.alternating import Filtered
 from ..footage.levels import Levels
-from ..io.images import read_image
+from ..io.images.image_files import read_image
 from ..io.limits import check_input
 from ..io.npy import map_npy, read_npz, write_npz
 from ..io.output import atomic_output, check_output

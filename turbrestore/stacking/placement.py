@@ -21,7 +21,7 @@ from ..core.arrays import FloatArray, check_flow
 from ..core.decision import Decision
 from ..core.errors import DataError
 from ..filtering.alternating import Filtered
-from ..io.images import read_image
+from ..io.images.image_files import read_image
 from ..io.npy import read_npz
 from ..io.source import FrameSource
 from ..registration.centroid import Centroid, mean_registered

@@ -31,7 +31,7 @@ from ..core.errors import DataError
 from ..core.noise import estimate_noise
 from ..registration.camera.global_shift import LEAST_CORRELATION, correlation, measure_shift
 from ..registration.flow import MIN_SIDE
-from ..registration.opencv_flow import DisParams, GreyImage, dis_solver
+from ..registration.flow_methods.opencv_flow import DisParams, GreyImage, dis_solver
 from ..registration.warp import sample_splines
 from .camera_path.camera import Matrix, camera_flow, fit_camera
 from .camera_path.path import smooth_motion, without_shake

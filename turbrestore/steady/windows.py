@@ -20,7 +20,7 @@ from ..core.errors import DataError
 from ..footage.checks.scene_cuts import similarity_at, thumbnail
 from ..registration.camera.global_shift import ShiftReference, prepare_shift_reference
 from ..registration.flow import normalise_to_8_bits
-from ..registration.opencv_flow import GreyImage
+from ..registration.flow_methods.opencv_flow import GreyImage
 from ..runtime.image_stacks import spline_planes
 from .grid import pixel_of, reduced
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
 from ..core.errors import require
-from ..io.images import read_image
+from ..io.images.image_files import read_image
 
 if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont, ImageFont

@@ -3,7 +3,8 @@
 Dense inverse search with variational refinement (Kroeger et al. 2016) is the default method of
 :mod:`turbrestore.registration.flow`.  It ends at half the resolution, where it takes an eighth of the time, because
 displacements of air are smooth over ten pixels; steps at full resolution
-(:mod:`turbrestore.registration.refinement_step`) find what is left.  Farneback's method (2003) takes no start.
+(:mod:`turbrestore.registration.flow_methods.refinement_step`) find what is left.  Farneback's method (2003) takes no
+start.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
-from ..core.errors import require, require_between
+from ...core.arrays import FloatArray
+from ...core.errors import require, require_between
 
 GreyImage = NDArray[np.uint8]
 # Takes frames (B, H, W), the flow that each starts from, or None, and whether drafts will do; returns flows

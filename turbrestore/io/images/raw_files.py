@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import DataError
-from ..core.extras import missing_package
-from .limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
-from .pixels import PixelArray
+from ...core.errors import DataError
+from ...core.extras import missing_package
+from ..limits import DEFAULT_LIMITS, Limits, check_input, first_line, input_errors
+from ..pixels import PixelArray
 
 RAW_SUFFIXES = (
     *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".orf", ".rw2", ".pef", ".srw", ".3fr"),

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import DataError, TurbrestoreError
-from ..core.extras import missing_package
-from .containers.pixel_formats import convert, native_format
-from .limits import Limits, first_line
-from .pixels import PixelArray, at_full_range
+from ...core.errors import DataError, TurbrestoreError
+from ...core.extras import missing_package
+from ..containers.pixel_formats import convert, native_format
+from ..limits import Limits, first_line
+from ..pixels import PixelArray, at_full_range
 
 CODED_SUFFIXES = (".heic", ".heif", ".hif", ".avif", ".jp2", ".j2k", ".jpx", ".jpf", ".jxl", ".dpx", ".exr")
 _JXL_CODESTREAM = b"\xff\x0a"

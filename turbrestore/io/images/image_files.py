@@ -1,7 +1,7 @@
 """Still images, and animated PNG, WebP and GIF files, by Pillow and imageio.
 
 Pillow reduces 16-bit colour to 8 bits, so OpenCV decodes those images once Pillow has found them whole; TIFF is read by
-:mod:`turbrestore.io.tiff`. The size in the header is checked before anything is decoded.
+:mod:`turbrestore.io.images.tiff`. The size in the header is checked before anything is decoded.
 """
 
 from __future__ import annotations
@@ -20,17 +20,16 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import FloatArray, check_image, from_unit, from_unit_to_type
-from ..core.errors import DataError, StorageError, TurbrestoreError
-from ..core.remarks import Doubt
-from .astronomy.fits import read_fits
-from .astronomy.fits_header import FITS_SUFFIXES, is_fits
-from .astronomy.fits_output import write_fits
-from .coded_images import CODED_SUFFIXES, decode_coded
-from .counts import holds_counts, range_of_counts
-from .limits import DEFAULT_LIMITS, Limits, check_input, content_suffix, first_line, input_errors
-from .output import atomic_output, atomic_write, check_output, check_space, frames_of_one_size
-from .pixels import (
+from ...core.arrays import FloatArray, check_image, from_unit, from_unit_to_type
+from ...core.errors import DataError, StorageError, TurbrestoreError
+from ...core.remarks import Doubt
+from ..astronomy.fits import read_fits
+from ..astronomy.fits_header import FITS_SUFFIXES, is_fits
+from ..astronomy.fits_output import write_fits
+from ..counts import holds_counts, range_of_counts
+from ..limits import DEFAULT_LIMITS, Limits, check_input, content_suffix, first_line, input_errors
+from ..output import atomic_output, atomic_write, check_output, check_space, frames_of_one_size
+from ..pixels import (
     ORIENTATION_TAG,
     PixelArray,
     at_full_range,
@@ -42,8 +41,9 @@ from .pixels import (
     upright,
     without_alpha,
 )
+from ..source import FrameSource, check_cut_short
+from .coded_images import CODED_SUFFIXES, decode_coded
 from .raw_files import RAW_SUFFIXES, read_raw_file
-from .source import FrameSource, check_cut_short
 from .tiff import TIFF_SUFFIXES, read_tiff
 
 if TYPE_CHECKING:

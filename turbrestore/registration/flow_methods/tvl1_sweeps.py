@@ -1,6 +1,6 @@
 """The inner loop of TV-L1 flow: primal-dual sweeps.
 
-Symbols as in :mod:`turbrestore.registration.tvl1`, and
+Symbols as in :mod:`turbrestore.registration.flow_methods.tvl1`, and
 
 u⁺ : flow after a sweep; ū : extrapolated flow ``2u⁺ − u``; ``ρ(u) = ρ₀ + g·u``, ``ĝ = g/|g|``
 p : dual variable, one vector (x, y) for each component of the flow, ``|p| ≤ 1``
@@ -30,9 +30,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..core.arrays import FloatArray
-from ..runtime.image_stacks import Shape, Stack, namespace, resize
-from ..runtime.jit import jit
+from ...core.arrays import FloatArray
+from ...runtime.image_stacks import Shape, Stack, namespace, resize
+from ...runtime.jit import jit
 
 # Bound of the squared norm of the gradient by forward differences.
 _SQUARED_NORM = 8.0

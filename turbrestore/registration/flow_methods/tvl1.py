@@ -16,10 +16,10 @@ of flat patches; the flow of turbulence is smooth, and α > 0 (Werlberger et al.
 Algorithm
 ---------
 From the coarsest level of a pyramid (factor 2) to the image: warp the frame by the present flow, linearise, minimise
-the convex problem by a few primal-dual sweeps (:mod:`turbrestore.registration.tvl1_sweeps`), filter the flow by a
-median of 5×5, which removes outliers (Wedel et al. 2009), and repeat until half of the pixels move by less than a
-tolerance.  A flow that starts from an earlier one goes through the two finest levels only, the coarser of which also
-builds up its dual variable.
+the convex problem by a few primal-dual sweeps (:mod:`turbrestore.registration.flow_methods.tvl1_sweeps`), filter
+the flow by a median of 5×5, which removes outliers (Wedel et al. 2009), and repeat until half of the pixels move by
+less than a tolerance.  A flow that starts from an earlier one goes through the two finest levels only, the coarser of
+which also builds up its dual variable.
 
 Departures from Zach et al. and OpenCV's DualTVL1
 --------------------------------------------------
@@ -45,10 +45,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray, check_flow, check_frames, check_grey, luminance
-from ..core.errors import DataError, require, require_between
-from ..runtime.device import CPU, find_device, memory_of
-from ..runtime.image_stacks import (
+from ...core.arrays import FloatArray, check_flow, check_frames, check_grey, luminance
+from ...core.errors import DataError, require, require_between
+from ...runtime.device import CPU, find_device, memory_of
+from ...runtime.image_stacks import (
     Shape,
     Stack,
     correlate,

@@ -29,8 +29,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
-from ..runtime.jit import jit
+from ...core.arrays import FloatArray
+from ...runtime.jit import jit
 
 GreyImage = NDArray[np.uint8]
 # Takes a frame (H, W) and a flow to it on the grid of :func:`half_grid`; returns the refined flow.

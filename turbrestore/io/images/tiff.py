@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, from_unit_to_type
-from ..core.errors import DataError
-from ..core.remarks import counted
-from .counts import source_of_numbers
-from .limits import DEFAULT_LIMITS, Limits, format_errors, input_errors
-from .npy import MappedFrames
-from .output import atomic_output, frames_of_one_size
-from .pixels import ORIENTATION_TAG, PixelArray, check_depth, upright
-from .source import FrameSource
+from ...core.arrays import FloatArray, from_unit_to_type
+from ...core.errors import DataError
+from ...core.remarks import counted
+from ..counts import source_of_numbers
+from ..limits import DEFAULT_LIMITS, Limits, format_errors, input_errors
+from ..npy import MappedFrames
+from ..output import atomic_output, frames_of_one_size
+from ..pixels import ORIENTATION_TAG, PixelArray, check_depth, upright
+from ..source import FrameSource
 
 if TYPE_CHECKING:
     import tifffile
