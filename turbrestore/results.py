@@ -171,17 +171,7 @@ class Restoration:
         return Verdict(_gained(self, motion), tuple(_checks(self, motion)))
 
     def plot(self) -> Figure:
-        """Draw the temporal mean beside the result.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-
-        Raises
-        ------
-        ConfigurationError
-            Matplotlib is not installed.
-        """
+        """Draw the temporal mean beside the result; ConfigurationError without Matplotlib."""
         x, y, width, height = self.crop
         return plot_images({"mean": self.mean[y : y + height, x : x + width], "result": self.image})
 
@@ -262,9 +252,10 @@ def _checks(restoration: Restoration, motion: float) -> Iterator[Check]:
 
 
 def _checks_of_blur(restoration: Restoration) -> Iterator[Check]:
-    done, readings, removed = restoration.deconvolution, restoration.guard_readings, _removed(restoration)
+    done, readings = restoration.deconvolution, restoration.guard_readings
     if done is None:
         return
+    removed = float(done.sigma)
     if removed > 0 and readings and not readings[-1].passed:
         yield write_check(CheckKind.TOO_SHARP, removed)
     if restoration.posterior is None:
@@ -287,10 +278,6 @@ def _share_of_air(flows: FloatArray) -> float:
     some = flows[:, ::4, ::4] - flows[:, ::4, ::4].mean(axis=0)
     shifts = np.median(some, axis=(1, 2), keepdims=True)
     return float(np.linalg.norm(some - shifts) / max(float(np.linalg.norm(some)), 1e-9))
-
-
-def _removed(restoration: Restoration) -> float:
-    return 0.0 if restoration.deconvolution is None else float(restoration.deconvolution.sigma)
 
 
 def _disputed(restoration: Restoration) -> float:

@@ -12,11 +12,8 @@ one: a fence within a scene is held in place by what is around it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 
@@ -33,21 +30,12 @@ def repetition(image: FloatArray) -> float:
     grey = luminance(image)
     side = min(_SIDE, *grey.shape)
     grey = grey - cv2.GaussianBlur(grey, (0, 0), side / 4)
-    windows = list(_windows(grey, side))
-    variances = np.array([float(window.var()) for window in windows])
-    detailed = [window for window, variance in zip(windows, variances, strict=True) if variance > _detail(variances)]
-    periods = np.array([_period(window) for window in detailed])
+    tops, lefts = (np.linspace(0, length - side, -(-length // side)).round().astype(int) for length in grey.shape)
+    windows = [grey[y : y + side, x : x + side] for y in tops for x in lefts]
+    least = max(_DETAIL * float(max(window.var() for window in windows)), 1e-8)
+    periods = np.array([_period(window) for window in windows if window.var() > least])
     found = periods[np.isfinite(periods)]
     return float(np.median(found)) if 2 * found.size > periods.size else np.inf
-
-
-def _detail(variances: NDArray[np.float64]) -> float:
-    return max(_DETAIL * float(variances.max()), 1e-8)
-
-
-def _windows(grey: FloatArray, side: int) -> Iterator[FloatArray]:
-    starts = [np.linspace(0, length - side, -(-length // side)).round().astype(int) for length in grey.shape]
-    yield from (grey[y : y + side, x : x + side] for y in starts[0] for x in starts[1])
 
 
 def _period(window: FloatArray) -> float:

@@ -85,17 +85,7 @@ class FlowDynamics:
     notes: tuple[str, ...]
 
     def plot(self) -> Figure:
-        """Draw the singular values of the flows and the eigenvalues of A.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-
-        Raises
-        ------
-        ConfigurationError
-            Matplotlib is not installed.
-        """
+        """Draw the singular values of the flows and the eigenvalues of A; ConfigurationError without Matplotlib."""
         return plot_dynamics(self.singular_values, self.eigenvalues)
 
     def __repr__(self) -> str:

@@ -174,7 +174,7 @@ def _white_part(image: FloatArray) -> FloatArray:
     frequency = np.hypot(np.arange(height)[:, None] / (2 * height), np.arange(width) / (2 * width))
     high = frequency >= _LIMITS.high
     fine = scipy.fft.idctn(spectrum * high, norm="ortho")
-    white = _deviation(fine) ** 2 / high.mean()
+    white = robust_scale(fine) ** 2 / high.mean()
     rings = (frequency * min(height, width) / 4).astype(np.int64)
     power = np.bincount(rings.ravel(), np.square(spectrum).ravel()) / np.maximum(np.bincount(rings.ravel()), 1)
     share = np.divide(white, power, out=np.ones_like(power), where=power > white).astype(np.float32)
@@ -183,11 +183,7 @@ def _white_part(image: FloatArray) -> FloatArray:
 
 
 def _usual(fine: FloatArray) -> NDArray[np.bool_]:
-    return np.asarray(np.abs(fine) < _LIMITS.outlier * _deviation(fine))
-
-
-def _deviation(fine: FloatArray) -> float:
-    return robust_scale(fine)
+    return np.asarray(np.abs(fine) < _LIMITS.outlier * robust_scale(fine))
 
 
 def _squared_slope(image: FloatArray) -> FloatArray:

@@ -120,17 +120,7 @@ class Centroid:
     converged: bool
 
     def plot(self) -> Figure:
-        """Draw how far every pixel moves over the frames.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-
-        Raises
-        ------
-        ConfigurationError
-            Matplotlib is not installed.
-        """
+        """Draw how far every pixel moves over the frames; ConfigurationError without Matplotlib."""
         return plot_displacements(self.flows, self.image)
 
     def _repr_html_(self) -> str:

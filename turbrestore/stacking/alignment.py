@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.errors import DataError
 from ..registration.camera.global_shift import correlation, measure_shift, prepare_shift_reference
+from ..registration.camera.stabilisation import find_similarity
 from ..registration.flow_algebra import compose_flows
 from ..registration.warp import inside, warp
 from ..steady.camera_path.camera import camera_flow, fit_camera
@@ -100,7 +101,7 @@ def align_to(image: FloatArray, reference: FloatArray) -> Alignment:
     if image.shape[:2] != reference.shape[:2]:
         raise DataError(f"image: expected the size of the reference {reference.shape[:2]}, found {image.shape[:2]}")
     a, b = _equally_sharp(luminance(reference), luminance(image))
-    best, A, features = -1.0, np.eye(2, 3), _FEATURES[0]
+    best, A, features = -1.0, np.eye(3), _FEATURES[0]
     for tried in _FEATURES:
         likeness, found = _similarity(a, b, tried)
         if likeness > best:
@@ -206,53 +207,31 @@ def _unit(feature: FloatArray) -> FloatArray:
     return np.clip(0.5 + feature / 8, 0, 1)
 
 
-def _negative(image: FloatArray) -> FloatArray:
-    return -_levels(image)
-
-
 def _similarity(a: FloatArray, b: FloatArray, features: _Features) -> tuple[float, Matrix]:
     """Similarity A, with the correlation that it reaches."""
     first, second = features
     coarse = [function(_reduced(image, _LEVELS[1])) for function, image in ((first, a), (second, b))]
     shift = measure_shift(_unit(coarse[1]), prepare_shift_reference(_unit(coarse[0])))
     found = np.zeros(2) if shift is None else shift * (a.shape[1] / coarse[0].shape[1])
-    warped = np.column_stack([np.eye(2), found])
+    warped = np.vstack([np.column_stack([np.eye(2), found]), (0, 0, 1)])
     for side in _LEVELS:
         pair = first(_reduced(a, side)), second(_reduced(b, side))
-        enlarged = _pixels_of(a.shape, pair[0].shape)
-        start = (np.linalg.inv(enlarged) @ np.vstack([warped, (0, 0, 1)]) @ enlarged)[:2].astype(np.float32)
-        try:
-            _, affine = cv2.findTransformECC(*pair, start, cv2.MOTION_AFFINE, _CRITERIA, None, 5)
-        except cv2.error:
-            # It does not converge where nothing is alike.
-            continue
-        whole = enlarged @ np.vstack([affine.astype(np.float64), (0, 0, 1)]) @ np.linalg.inv(enlarged)
-        warped = _closest_similarity(whole, a.shape)
+        _, warped = find_similarity(*pair, a.shape, warped, _CRITERIA, 5)
     alike = correlation(first(a), warp(second(b), _joined(warped, a.shape)))
     return alike, warped
 
 
-_FEATURES: tuple[_Features, ...] = ((_levels, _levels), (_levels, _negative), (_edges, _edges))
+_FEATURES: tuple[_Features, ...] = (
+    (_levels, _levels),
+    (_levels, lambda image: -_levels(image)),
+    (_edges, _edges),
+)
 
 
 def _reduced(image: FloatArray, side: int) -> FloatArray:
     factor = max(1.0, max(image.shape) / side)
     size = round(image.shape[1] / factor), round(image.shape[0] / factor)
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-
-
-def _pixels_of(shape: tuple[int, ...], reduced: tuple[int, ...]) -> Matrix:
-    """From pixels of a reduced image to those of the image; centres of pixels lie at half of their side."""
-    x, y = shape[1] / reduced[1], shape[0] / reduced[0]
-    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])
-
-
-def _closest_similarity(affine: Matrix, shape: tuple[int, ...]) -> Matrix:
-    """Rotation and scale of an affine map, which agrees with it at the centre of the image."""
-    centre = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
-    along, across = (affine[0, 0] + affine[1, 1]) / 2, (affine[1, 0] - affine[0, 1]) / 2
-    linear = np.array([[along, -across], [across, along]])
-    return np.column_stack([linear, affine[:2, :2] @ centre + affine[:2, 2] - linear @ centre])
 
 
 def _joined(A: Matrix, shape: tuple[int, ...]) -> FloatArray:

@@ -30,7 +30,7 @@ Matrix = NDArray[np.float64]
 # Frames that tell whether the camera turns, and by how many pixels the corners then move in most of them.
 _SAMPLES, _TURNS = 9, 2.0
 # Iterations of the correlation, and the change of it that ends them.
-_ITERATIONS, _CHANGE = 50, 1e-4
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-4)
 
 
 def mean_stabilised(frames: ArrayLike, threads: int = 0) -> FloatArray:
@@ -80,33 +80,43 @@ def _measure(
     stack: FloatArray, reference: FloatArray, shifts: Shift, numbers: Sequence[int], threads: int
 ) -> dict[int, Matrix]:
     """Similarities from the frame of the reference to others; none for frames that are unlike it."""
-    height, width = stack.shape[1:3]
-    scale = np.array([width / reference.shape[1], height / reference.shape[0]])
-    # Centres of pixels lie at half of their side.
-    enlarged = np.array([[scale[0], 0, (scale[0] - 1) / 2], [0, scale[1], (scale[1] - 1) / 2], [0, 0, 1]])
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, _ITERATIONS, _CHANGE)
 
     def pose(pair: tuple[FloatArray, NDArray[np.float64]]) -> Matrix | None:
         frame, shift = pair
-        start = np.column_stack([np.eye(2), shift / scale]).astype(np.float32)
-        try:
-            alike, affine = cv2.findTransformECC(
-                reference, reduce_image(frame), start, cv2.MOTION_AFFINE, criteria, None, 3
-            )
-        except cv2.error:
-            # The iteration does not converge where nothing is alike.
-            return None
-        if alike < LEAST_CORRELATION:
-            return None
-        whole = np.vstack([np.asarray(affine, np.float64), (0.0, 0.0, 1.0)])
-        return _similarity(enlarged @ whole @ np.linalg.inv(enlarged), (height, width))
+        start = np.vstack([np.column_stack([np.eye(2), shift]), (0, 0, 1)])
+        alike, found = find_similarity(reference, reduce_image(frame), stack.shape[1:3], start, _CRITERIA, 3)
+        return None if alike < LEAST_CORRELATION else found
 
     pairs = zip(iter_frames(map(stack.__getitem__, numbers)), shifts[np.asarray(numbers)], strict=True)
     measured = zip(numbers, map_ahead(pose, pairs, threads), strict=True)
     return {number: found for number, (_, found) in measured if found is not None}
 
 
-def _similarity(affine: Matrix, shape: tuple[int, int]) -> Matrix:
+def find_similarity(
+    reference: FloatArray,
+    image: FloatArray,
+    shape: tuple[int, ...],
+    start: Matrix,
+    criteria: tuple[int, int, float],
+    window: int,
+) -> tuple[float, Matrix]:
+    """Return the enhanced correlation coefficient of two reduced images and the similarity that maximises it.
+
+    ``start`` and similarity (3, 3) are those of the whole images, (H, W).  Where nothing is alike, -1 and the start.
+    """
+    x, y = shape[1] / reference.shape[1], shape[0] / reference.shape[0]
+    # Centres of pixels lie at half of their side.
+    enlarged = np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]])
+    reduced = (np.linalg.inv(enlarged) @ start @ enlarged)[:2].astype(np.float32)
+    try:
+        alike, affine = cv2.findTransformECC(reference, image, reduced, cv2.MOTION_AFFINE, criteria, None, window)
+    except cv2.error:
+        return -1.0, start
+    whole = np.vstack([np.asarray(affine, np.float64), (0.0, 0.0, 1.0)])
+    return alike, _similarity(enlarged @ whole @ np.linalg.inv(enlarged), shape)
+
+
+def _similarity(affine: Matrix, shape: tuple[int, ...]) -> Matrix:
     """Turn and zoom of an affine map, which agrees with it at the centre of the image."""
     centre = np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
     along, across = (affine[0, 0] + affine[1, 1]) / 2, (affine[1, 0] - affine[0, 1]) / 2
