@@ -116,8 +116,10 @@ LIBRARIES = {
 # What takes longest to import of the libraries that a command needs.
 SLOW = {"scipy.fft", "scipy.linalg", "scipy.ndimage", "scipy.optimize", "scipy.sparse", "scipy.special", "scipy.stats"}
 PARSER = {"cyclopts", "rich"}
-# What a restoration takes only where an option asks for it.
-ON_DEMAND = LIBRARIES - {"cv2", "numba", "scipy"} | {"rich", "skimage", "PIL", "imageio", "tifffile", "rawpy", "jinja2"}
+# What a restoration takes only where an option asks for it.  Numba imports the topmost module of SciPy.
+ON_DEMAND = (
+    LIBRARIES - {"cv2", "numba", "scipy"} | SLOW | {"rich", "skimage", "PIL", "imageio", "tifffile", "rawpy", "jinja2"}
+)
 ON_DEMAND |= {"turbrestore.report"}
 
 

@@ -3,8 +3,9 @@
 import cv2
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
-from turbrestore.core.noise import photon_noise
+from turbrestore.core.noise import nonnegative_least_squares, photon_noise
 from turbrestore.deconvolution.problem import margin_around
 from turbrestore.synthesis.scenes import resolution_chart
 
@@ -48,3 +49,14 @@ def test_weights_are_the_inverse_of_the_noise_and_limited(scene):
     assert 0.25 <= inside.min() < 0.7 and 1.5 < inside.max() <= 4
     assert inside[:, :20].mean() > 2 * inside[:, -20:].mean()
     assert (margin.weights(scene, None) == margin.mask()).all()
+
+
+def test_least_squares_without_negative_unknowns_are_those_of_scipy():
+    rng = np.random.default_rng(2)
+    for rows, columns in ((2, 1), (3, 5), (8, 8), (24, 13)):
+        for values in rng.standard_normal((20, rows)):
+            design = rng.standard_normal((rows, columns))
+            unknowns, misfit = nonnegative_least_squares(design, values)
+            assert (unknowns >= 0).all()
+            assert misfit == pytest.approx(nnls(design, values)[1], abs=1e-9)
+            assert misfit == pytest.approx(np.linalg.norm(design @ unknowns - values))

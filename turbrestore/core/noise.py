@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from .arrays import FloatArray, check_grey
@@ -19,6 +18,8 @@ _LEVELS, _PIXELS, _FLATTEST = 12, 200, 0.2
 # Noise is that of photons if the curve has so many levels, a line leaves no more than this share of what it varies by,
 # and it is so many times larger where it is bright.
 _FEWEST_LEVELS, _STRAIGHT, _PHOTONS = 5, 0.5, 4.0
+# Share of the steepest slope of a sum of squares below which a slope is rounding.
+_LEAST_GRADIENT = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +69,7 @@ def fit_noise_curve(level: FloatArray, variance: FloatArray, energy: FloatArray)
     design[np.arange(2 * len(found)), np.repeat(np.arange(len(found)), 2)] = 1
     scale = max(float(found[..., 2].max()), 1e-18)
     design[:, -1] = found[..., 2].ravel() / scale
-    variances, _ = scipy.optimize.nnls(design, found[..., 1].ravel())
+    variances, _ = nonnegative_least_squares(design, found[..., 1].ravel())
     return NoiseCurve(known, variances[:-1])
 
 
@@ -87,13 +88,46 @@ def photon_noise(first: FloatArray, second: FloatArray) -> NoiseCurve | None:
     if len(found.levels) < _FEWEST_LEVELS:
         return None
     above = found.levels - float(level.min())
-    line, residual = scipy.optimize.nnls(np.stack([np.ones_like(above), above], axis=1), found.variances)
+    line, residual = nonnegative_least_squares(np.stack([np.ones_like(above), above], axis=1), found.variances)
     variances = line[0] + line[1] * above
     spread = float(np.linalg.norm(found.variances - found.variances.mean()))
     if residual > _STRAIGHT * spread or variances[-1] < _PHOTONS * max(variances[0], 1e-12):
         return None
     curve = NoiseCurve(found.levels, variances)
     return NoiseCurve(found.levels, variances / float(curve.variance(level).mean()))
+
+
+def nonnegative_least_squares(
+    design: NDArray[np.float64], values: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """Minimise ``‖A x − b‖`` over ``x ≥ 0`` by active sets (Lawson and Hanson 1974); return x and the least norm.
+
+    SciPy has the same, but takes longer to import than a small clip to restore.
+    ``design`` (m, n) is A, ``values`` (m,) is b.
+    """
+    x, free = np.zeros(design.shape[1]), np.zeros(design.shape[1], bool)
+    gradient = design.T @ values
+    tolerance = _LEAST_GRADIENT * float(np.abs(gradient).max())
+    # As many turns as SciPy takes at most: rounding may let one unknown come and go.
+    for _ in range(3 * len(x)):
+        if not (gradient[~free] > tolerance).any():
+            break
+        free[np.argmax(np.where(free, -np.inf, gradient))] = True
+        while True:
+            found = np.zeros_like(x)
+            found[free] = np.linalg.lstsq(design[:, free], values, rcond=None)[0]
+            falling = free & (found <= 0)
+            if not falling.any():
+                break
+            # Go towards it until the first unknown is zero.
+            shares = np.where(falling, x, np.inf) / np.where(falling, x - found, 1)
+            first = int(np.argmin(shares))
+            x += shares[first] * (found - x)
+            free &= x > 0
+            free[first] = False
+        x = found
+        gradient = design.T @ (values - design @ x)
+    return x, float(np.linalg.norm(design @ x - values))
 
 
 def estimate_noise(image: ArrayLike) -> float:

@@ -16,13 +16,13 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import scipy
 
 from ..core.arrays import FloatArray, luminance
 from ..core.noise import fit_noise_curve
 from ..core.noise_spectrum import NoiseSpectrum
 from ..registration.registered_noise import noise_of_frames
 from ..registration.warp import warp
+from ..runtime.fourier import irfft2, rfft2
 from ..runtime.scratch import iter_frames
 from ..runtime.threads import map_ahead, sum_in_threads
 from .frame_noise import (
@@ -240,8 +240,8 @@ def _coloured(template: FloatArray, noise: NoiseSpectrum) -> FloatArray:
     """Template on which white noise projects as noise of a spectrum and of the same variance does on ``template``."""
     frequency = np.hypot(np.fft.fftfreq(template.shape[1])[:, None], np.fft.rfftfreq(template.shape[2]))
     response = np.sqrt(noise.at(frequency)) / noise.deviation
-    spectrum = scipy.fft.rfft2(template) * response.astype(np.float32)
-    return np.asarray(scipy.fft.irfft2(spectrum, s=template.shape[1:]), np.float32)
+    spectrum = rfft2(template) * response.astype(np.float32)
+    return np.asarray(irfft2(spectrum, template.shape[1:]), np.float32)
 
 
 def _leave_middle_out(
