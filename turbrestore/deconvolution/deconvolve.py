@@ -350,7 +350,7 @@ def _noise_and_fidelity(
 ) -> tuple[float, float]:
     """Noise that the deconvolution meets, and λ.
 
-    Second differences tell white noise.  Of smooth noise, what there certainly is where the blur passes one half counts.
+    Second differences tell white noise.  Of smooth noise, what there certainly is at the half frequency counts.
     """
     noise = float(np.sqrt(np.mean([estimate_noise(plane) ** 2 for plane in planes])))
     if spectrum is not None:
