@@ -350,11 +350,11 @@ class TestStream:
         assert min(sigmas[3:]) > 0.5
 
     def test_a_live_stream_gains_from_the_frames_before(self):
-        scene = photo()
+        scene = photo("coins")
         frames = shaken([scene] * 20)
         live, near = (images(frames, sigma=0, **kw) for kw in ({"live": True}, {"reach": 2}))
         gains = [np.mean([psnr(image, scene) for image in ours[10:]]) for ours in (live, near)]
-        assert gains[0] > gains[1] + 0.2
+        assert gains[0] > gains[1] + 0.5
 
     def test_a_cut_starts_anew(self):
         first, second = photo(), photo("brick")
