@@ -116,11 +116,9 @@ LIBRARIES = {
 # What takes longest to import of the libraries that a command needs.
 SLOW = {"scipy.fft", "scipy.linalg", "scipy.ndimage", "scipy.optimize", "scipy.sparse", "scipy.special", "scipy.stats"}
 PARSER = {"cyclopts", "rich"}
-# What a restoration takes only where an option asks for it.  Numba imports the topmost module of SciPy.
-ON_DEMAND = (
-    LIBRARIES - {"cv2", "numba", "scipy"} | SLOW | {"rich", "skimage", "PIL", "imageio", "tifffile", "rawpy", "jinja2"}
-)
-ON_DEMAND |= {"turbrestore.report"}
+# What a restoration takes only where an option asks for it.  Numba takes its linear algebra from SciPy.
+ON_DEMAND = LIBRARIES - {"cv2", "numba", "scipy"} | SLOW - {"scipy.linalg"}
+ON_DEMAND |= {"rich", "skimage", "PIL", "imageio", "tifffile", "rawpy", "jinja2", "turbrestore.report"}
 
 
 @pytest.mark.parametrize(

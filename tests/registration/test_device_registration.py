@@ -88,7 +88,7 @@ def test_a_centroid_is_that_of_the_cpu_and_repeats_to_the_byte(device):
 @pytest.mark.parametrize(
     ("place", "advice", "params"),
     [
-        ("tvl1.tvl1_flows", "lower flow.tvl1.batch", TVL1),
+        ("flow_methods.tvl1.tvl1_flows", "lower flow.tvl1.batch", TVL1),
         ("warp.warp_stack", "process a smaller part .*", FlowParams()),
     ],
 )
