@@ -20,6 +20,7 @@ from .core.decision import Decision
 from .core.noise import NoiseCurve, photon_noise
 from .core.noise_spectrum import NoiseSpectrum
 from .deconvolution.conjugate_gradient import wiener_filtered
+from .filtering.filter_records import Filtered
 from .fusion import Run
 from .registration.flow_algebra import invert_flow
 from .registration.recentring import recentring_flow
@@ -43,15 +44,17 @@ class Evidence:
     saturation: float  # intensity from which the mean is saturated
     is_mean: bool = False  # whether the mean replaces the filtered image, which has structure that the frames lack
     finds_blur: bool = True  # whether a blur is looked for
+    noise: NoiseSpectrum | None = None  # of the filtered image
     witnesses: BlurWitnesses | None = None  # None if no blur is to be estimated
     halves: HalvedClip | None = None  # None then
 
 
 def evidence_of_frames(
-    run: Run, fused: Restoration, training: FloatArray, mean_flow: FloatArray, saturation: float
+    run: Run, fused: Restoration, filtered: Filtered, training: FloatArray, saturation: float
 ) -> tuple[Restoration, Evidence]:
     """Check that the frames have the structure of the filtered image, else take the mean; measure how blurred it is."""
     image, flows = luminance(fused.image), fused.centroid.flows
+    mean_flow = filtered.mean_flow
     if mean_flow.any():
         # The flows start from the geometry of the centroid.
         image = warp(image, invert_flow(recentring_flow(mean_flow)))
@@ -62,25 +65,22 @@ def evidence_of_frames(
     fused = replace(fused, structure=structure, is_mean=not structure.explained)
     if fused.is_mean:
         return replace(fused, image=fused.mean), Evidence(saturation, is_mean=True)
+    noise = _fused_noise(filtered, halves)
     # No guard overrides a width that was asked for.
     if not run.params.finds_blur:
-        return fused, Evidence(saturation)
+        return fused, Evidence(saturation, noise=noise)
     if structure.changes or len(training) < FEW_FRAMES:
         run.decide(*explain_few_frames(len(training)))
         return fused, Evidence(saturation, finds_blur=False)
-    witnesses, halves = _find_witnesses(run, training, fused, halves.alternate.mean), halves.recentred(mean_flow)
-    witnesses = replace(witnesses, noise=_fused_noise(fused, halves))
-    return fused, Evidence(saturation, witnesses=witnesses, halves=halves)
+    witnesses = _find_witnesses(run, training, fused, halves.alternate.mean)
+    return fused, Evidence(saturation, noise=noise, witnesses=witnesses, halves=halves.recentred(mean_flow))
 
 
-def _fused_noise(fused: Restoration, halves: HalvedClip) -> NoiseSpectrum:
+def _fused_noise(filtered: Filtered, halves: HalvedClip) -> NoiseSpectrum:
     """Noise of the filtered image: that of the mean of the training frames, for as many frames as its weights leave."""
-    noise, filtered = halves.alternate.noise(), fused.filtered
-    if filtered is None:
-        return noise
     # Σ / Z₀ is one over the number of frames that count.
     counting = filtered.image_noise / max(float(filtered.variance.mean()), 1e-12)
-    return noise.scaled(halves.count / counting * filtered.noise_gain)
+    return halves.alternate.noise().scaled(halves.count / counting * filtered.noise_gain)
 
 
 def _find_witnesses(run: Run, training: FloatArray, fused: Restoration, mean: FloatArray) -> BlurWitnesses:

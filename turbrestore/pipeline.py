@@ -192,7 +192,7 @@ def _fuse(run: Run) -> tuple[Restoration, Evidence]:
     )
     if filtered is None:
         return fused, Evidence(saturation)
-    return evidence_of_frames(run, fused, training, filtered.mean_flow, saturation)
+    return evidence_of_frames(run, fused, filtered, training, saturation)
 
 
 def _deblur_and_crop(run: Run, fused: Restoration, evidence: Evidence, psf: NDArray[np.float64] | None) -> Restoration:
@@ -221,7 +221,7 @@ def _deblur_and_crop(run: Run, fused: Restoration, evidence: Evidence, psf: NDAr
         decisions=tuple(run.decisions),
         uncertainty=None if deviation is None else deviation[part],
         disagreement=None if agreed is None else agreed.share[part],
-        noise=None if evidence.witnesses is None else evidence.witnesses.noise,
+        noise=evidence.noise,
         unseen=_unseen_share(run, seen, part, fused.train),
     )
     if deblurred is None:
@@ -266,7 +266,9 @@ def _remove_blur(
         guide = recentre(guide, fused.filtered.mean_flow)
     settings = params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side
     full_scale = run.prepared.levels.full_scale
-    steps = remove_blur_steps(fused.image, guide, *settings, evidence.witnesses, psf, photons, full_scale)
+    steps = remove_blur_steps(
+        fused.image, guide, *settings, evidence.witnesses, psf, photons, full_scale, evidence.noise
+    )
     return finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
 
 

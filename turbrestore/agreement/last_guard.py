@@ -98,10 +98,10 @@ def keep_agreed(
 
 
 def keep_agreed_memory(shape: tuple[int, ...]) -> float:
-    """Bytes that :func:`keep_agreed` takes for an image of (H, W) or (H, W, 3) pixels, its result among them."""
+    """Bytes that :func:`keep_agreed` takes for an image (H, W[, 3]), its result and deblurred halves among them."""
     channels = shape[2] if len(shape) == 3 else 1
     rows = min(shape[0], _ROWS + 2 * _AROUND)
-    return shape[1] * float(shape[0] * 4 * (3 + channels) + rows * (_BYTES + _CHANNEL_BYTES * channels))
+    return shape[1] * float(shape[0] * 4 * (7 + channels) + rows * (_BYTES + _CHANNEL_BYTES * channels))
 
 
 def _agreed(

@@ -80,13 +80,14 @@ def remove_blur_steps(
     psf: Float64Array | None = None,
     photons: NoiseCurve | None = None,
     full_scale: tuple[float, float] = (0.0, 1.0),
+    noise: NoiseSpectrum | None = None,
 ) -> Steps[Deblurred]:
     """Remove a blur step by step; see :func:`remove_blur`.
 
     With ``side`` the image is deconvolved in tiles of at most that side, pixels, which takes less memory.  Where there
     are ``witnesses``, the frames tell the blur together with the image.  ``psf`` (h, w) is the point spread
     function, if it is known.  ``photons`` is the noise of the image at every level, relative to its mean;
-    ``full_scale`` is black and white.
+    ``full_scale`` is black and white, and ``noise`` the spectrum of the noise of the image.
     """
     params, guards = deconvolution or DeconvolutionParams(), guards or GuardParams()
     if psf is not None:
@@ -97,7 +98,6 @@ def remove_blur_steps(
     else:
         sigma, params = posterior.removed, replace(params, exponent=params.exponent or posterior.exponent)
     size = image.shape[0], image.shape[1]
-    noise = None if witnesses is None else witnesses.noise
     in_tiles = () if side is None or find_device(runtime.device) != CPU else halo_tiles(size, side)
 
     def remove(width: float) -> Steps[Deconvolution]:

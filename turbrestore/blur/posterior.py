@@ -43,7 +43,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
-from ..core.noise_spectrum import NoiseSpectrum
 from ..registration.registered_noise import noise_of_frames
 from .psf import Float64Array
 from .witnesses.hypotheses import LEAST_TRANSFER, Hypotheses, hypotheses, shapes
@@ -95,7 +94,6 @@ class BlurWitnesses:
     variation: SpectralVariation | None = None  # s and s_4, if they could be measured
     diffraction: float | None = None  # λ/D of known optics, pixels
     spread: float | None = None  # standard deviation of ln V, if V is what a measured D/r0 makes
-    noise: NoiseSpectrum | None = None  # of the fused image
 
 
 @dataclass(frozen=True, eq=False)

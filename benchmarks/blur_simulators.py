@@ -1,0 +1,284 @@
+"""Simulated clips of known blur from which the width of a blur is learnt: four simulators, and clips without any blur.
+
+``screens``   anisoplanatic phase screens of random strength, diffraction, outer scale, path and wind
+``kernels``   weighted sums of a few random speckled kernels, whose weights change from place to place and in time
+``lens``      one Gaussian, disc or square for the whole clip, moved by smooth flows or not at all
+``mixed``     Gaussians whose width changes from place to place and from frame to frame
+``near``      the latter with blur of 3 to 8 pixels and long displacements, as of air that is close to the camera
+``none``      sharp or soft scenes that smooth flows move or that stand still
+
+Scenes are those that no other benchmark shows: dead leaves (Lee, Mumford and Huang 2001), random text and bars, and
+photographs of scikit-image and scikit-learn.  A camera then adds noise, sharpens or smooths, and compresses.
+"""
+
+from __future__ import annotations
+
+import string
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import skimage.data
+from blur_clips import h264
+
+from turbrestore.core.arrays import FloatArray
+from turbrestore.registration.flow_algebra import invert_flow
+from turbrestore.registration.warp import warp
+from turbrestore.synthesis.anisoplanatic import phase_screen_frames
+from turbrestore.synthesis.atmosphere import PhaseScreenParams
+from turbrestore.synthesis.sequence import CameraParams
+from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
+
+PHOTOGRAPHS = ("gravel", "hubble_deep_field", "immunohistochemistry", "colorwheel", "china", "flower")
+# Simulators and their shares of the clips.
+SHARES = {"screens": 0.3, "kernels": 0.2, "lens": 0.15, "mixed": 0.15, "near": 0.08, "none": 0.12}
+# Pixels around a clip from which displacement brings in what the frame does not show at rest.
+MARGIN = 32
+# Widths of the stack of blurred scenes that ``mixed`` interpolates.
+STACK = np.array([0.0, 0.4, 0.7, 1.0, 1.4, 1.9, 2.5, 3.2, 4.1, 5.2, 6.6, 8.2, 10.0])
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedClip:
+    """Frames (T, H, W) and the scene (H, W) in their mean geometry."""
+
+    simulator: str
+    scene: str
+    frames: FloatArray
+    truth: FloatArray
+
+
+def simulate(seed: int) -> SimulatedClip:
+    """Draw everything about a clip from a seed."""
+    rng = np.random.default_rng(seed)
+    simulator = str(rng.choice(list(SHARES), p=list(SHARES.values())))
+    side = int(rng.integers(168, 224)) if simulator == "near" else int(rng.integers(112, 177))
+    name = str(rng.choice(["leaves", "text", "bars", "photograph"], p=[0.5, 0.15, 0.05, 0.3]))
+    scene = draw_scene(name, side + 2 * MARGIN, rng)
+    count = int(np.exp(rng.uniform(np.log(6), np.log(60))))
+    frames, truth = _SIMULATORS[simulator](scene, count, rng)
+    return SimulatedClip(simulator, name, record(frames, rng), truth)
+
+
+def draw_scene(name: str, side: int, rng: np.random.Generator) -> FloatArray:
+    """Draw a grey square of this side with a contrast that can be seen."""
+    scene = {"leaves": _leaves, "text": _text, "bars": _bars, "photograph": _photograph}[name](side, rng)
+    if rng.uniform() < 0.25:
+        scene = cv2.GaussianBlur(scene, (0, 0), float(rng.uniform(0.3, 1.0)))
+    if rng.uniform() < 0.3:
+        scene = np.float32(rng.uniform(0, 0.4)) + np.float32(rng.uniform(0.15, 0.6)) * scene
+    contrast = float(scene.std())
+    if contrast < 0.03:
+        scene = (scene - scene.mean()) * 0.06 / max(contrast, 1e-6) + 0.5
+    return np.clip(scene, 0, 1).astype(np.float32)
+
+
+def _leaves(side: int, rng: np.random.Generator) -> FloatArray:
+    image = np.full((side, side), rng.uniform(), np.float32)
+    for _ in range(int(rng.choice([200, 700, 2500]))):
+        radius = min(3.0 * rng.uniform() ** (-1 / 1.9), side / 3)
+        x, y = (int(v) for v in rng.uniform(-20, side + 20, 2))
+        level, turn = float(np.clip(rng.normal(0.5, 0.25), 0, 1)), float(rng.uniform(0, 180))
+        narrow = rng.uniform(0.1, 1)
+        if rng.uniform() < 0.5:
+            axes = int(radius), max(1, int(radius * narrow))
+            cv2.ellipse(image, (x, y), axes, turn, 0, 360, level, -1, cv2.LINE_AA)
+        else:
+            box = cv2.boxPoints(((float(x), float(y)), (2 * radius, 2 * radius * narrow), turn))
+            cv2.fillPoly(image, [np.int32(box * 16)], level, cv2.LINE_AA, 4)
+    if rng.uniform() < 0.6:
+        texture = cv2.GaussianBlur(rng.standard_normal((side, side)).astype(np.float32), (0, 0), rng.uniform(0.5, 2))
+        image += np.float32(rng.uniform(0.01, 0.08)) * texture / texture.std()
+    return np.clip(image, 0, 1)
+
+
+def _text(side: int, rng: np.random.Generator) -> FloatArray:
+    dark, bright = sorted(rng.uniform(0, 1, 2)) if rng.uniform() < 0.5 else (0.05, 0.95)
+    image = np.full((side, side), 255, np.uint8)
+    size, fonts = float(rng.uniform(0.35, 1.6)), (0, 1, 2, 3, 4, 6, 7)
+    font, thick = int(rng.choice(fonts)), int(rng.integers(1, max(2, int(2.5 * size)) + 1))
+    step = int(30 * size + rng.uniform(0, 14))
+    for row in range(step, side + step, step):
+        word = "".join(rng.choice(list(string.ascii_letters + string.digits + " .,-"), 40))
+        cv2.putText(image, word, (int(rng.uniform(-30, 20)), row), font, size, 0, thick, cv2.LINE_AA)
+    page = np.float32(dark) + np.float32(bright - dark) * image.astype(np.float32) / 255
+    return 1 - page if rng.uniform() < 0.3 else page
+
+
+def _bars(side: int, rng: np.random.Generator) -> FloatArray:
+    image = np.full((side, side), rng.uniform(0, 1), np.float32)
+    for _ in range(int(rng.integers(4, 16))):
+        period, lines = float(rng.uniform(3, 24)), int(rng.integers(2, 8))
+        x, y = rng.uniform(0, side, 2)
+        level, turn = float(rng.uniform(0, 1)), np.deg2rad(rng.choice([0, 90, rng.uniform(0, 180)]))
+        across = np.array([-np.sin(turn), np.cos(turn)])
+        for line in range(lines):
+            middle = np.array([x, y]) + line * period * across
+            box = cv2.boxPoints((tuple(middle), (period * lines, period / 2), float(np.rad2deg(turn))))
+            cv2.fillPoly(image, [np.int32(box * 16)], level, cv2.LINE_AA, 4)
+    return image
+
+
+def _photograph(side: int, rng: np.random.Generator) -> FloatArray:
+    name = str(rng.choice(PHOTOGRAPHS))
+    if name in ("china", "flower"):
+        from sklearn.datasets import load_sample_image
+
+        image = load_sample_image(f"{name}.jpg")
+    else:
+        image = getattr(skimage.data, name)()
+    grey = cv2.cvtColor(image[..., :3], cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
+    grey = np.float32(grey) / 255
+    scale = max(float(rng.choice([0.5, 0.7, 1.0])), (side + 1) / min(grey.shape))
+    grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    y, x = (int(rng.integers(0, length - side + 1)) for length in grey.shape)
+    return grey[y : y + side, x : x + side]
+
+
+def _screens(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    params = PhaseScreenParams(d_over_r0=1.0)
+    while params.tilt_rms() > 3.5 or params.strength == 1.0:
+        params = PhaseScreenParams(
+            d_over_r0=float(np.exp(rng.uniform(np.log(0.6), np.log(7)))),
+            nyquist=float(rng.uniform(0.5, 2.2)),
+            outer_scale=float(np.exp(rng.uniform(np.log(0.5), np.log(50)))),
+            distance=float(np.exp(rng.uniform(np.log(500), np.log(6000)))),
+            wind=(float(rng.uniform(1, 25)),),
+        )
+    lens = float(rng.choice([0, 0, 0.8, 1.3]))
+    blurred = cv2.GaussianBlur(scene, (0, 0), lens) if lens else scene
+    camera = CameraParams(photons=np.inf, read_noise=0.0)
+    made = list(phase_screen_frames(blurred[MARGIN:-MARGIN, MARGIN:-MARGIN], count, rng, params, camera))
+    mean = np.mean([frame.flow for frame in made], axis=0, dtype=np.float32)
+    return np.stack([frame.image for frame in made]), warp(scene[MARGIN:-MARGIN, MARGIN:-MARGIN], invert_flow(mean))
+
+
+def _kernels(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    kinds, width = 7, float(np.exp(rng.uniform(np.log(0.4), np.log(3.0))))
+    stack = [cv2.filter2D(scene, -1, _speckles(width, rng), borderType=cv2.BORDER_REFLECT_101) for _ in range(kinds)]
+    logs = _wandering(count, (*scene.shape, kinds), float(rng.uniform(10, 60)), float(rng.choice([0, 0.5, 0.9])), rng)
+    contrast, flows, frames = float(rng.uniform(0.5, 2.5)), _flows(count, scene.shape, rng), []
+    for log in logs:
+        weights = np.exp(contrast * log)
+        weights /= weights.sum(-1, keepdims=True)
+        frames.append(sum(weights[..., kind] * stack[kind] for kind in range(kinds)))
+    return _moved(scene, frames, flows)
+
+
+def _speckles(width: float, rng: np.random.Generator) -> FloatArray:
+    """Random kernel of a few spots within a Gaussian of this width, pixels, centred."""
+    radius = int(np.ceil(4 * width)) + 2
+    y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1].astype(np.float64)
+    kernel, spots = np.zeros_like(x), int(rng.integers(1, 7))
+    spot = max(float(rng.uniform(0.35, 0.9)) * width, 0.3)
+    spread = max(width**2 - spot**2, 0.0) ** 0.5
+    places, powers = spread * rng.standard_normal((spots, 2)), rng.exponential(size=spots)
+    places -= np.average(places, axis=0, weights=powers)
+    for (across, down), power in zip(places, powers, strict=True):
+        kernel += power * np.exp(-((x - across) ** 2 + (y - down) ** 2) / (2 * spot**2))
+    return np.float32(kernel / kernel.sum())
+
+
+def _lens(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    blurred = _optics(scene, float(np.exp(rng.uniform(np.log(0.4), np.log(4)))), rng)
+    flows = _flows(count, scene.shape, rng)
+    if rng.uniform() < 0.25:
+        flows = np.zeros_like(flows)
+    # A lens blurs what the air has moved; what the air has blurred moves.
+    return _moved(scene, [blurred] * count, flows)
+
+
+def _optics(scene: FloatArray, width: float, rng: np.random.Generator) -> FloatArray:
+    kind = str(rng.choice(["gaussian", "disc", "square"]))
+    if kind == "gaussian":
+        return cv2.GaussianBlur(scene, (0, 0), width)
+    # Disc and square of the same variance, drawn eight times as fine.
+    radius = width * (2.0 if kind == "disc" else 3**0.5)
+    side = 2 * int(np.ceil(radius)) + 3
+    fine = np.abs(np.mgrid[: 8 * side, : 8 * side] - (4 * side - 0.5)) / 8
+    inside = (np.hypot(*fine) if kind == "disc" else fine.max(0)) <= radius
+    kernel = inside.reshape(side, 8, side, 8).mean((1, 3))
+    return cv2.filter2D(scene, -1, np.float32(kernel / kernel.sum()), borderType=cv2.BORDER_REFLECT_101)
+
+
+def _mixed(
+    scene: FloatArray, count: int, rng: np.random.Generator, widths: tuple[float, float] = (0.4, 2.6)
+) -> tuple[FloatArray, FloatArray]:
+    middle, spread = float(np.exp(rng.uniform(*np.log(widths)))), float(rng.uniform(0.1, 0.6))
+    persistence, length = float(rng.choice([0, 0.5, 0.9])), float(rng.uniform(12, 60))
+    stack = np.stack([scene if width == 0 else cv2.GaussianBlur(scene, (0, 0), width) for width in STACK], -1)
+    logs = _wandering(count, (*scene.shape, 1), length, persistence, rng)[..., 0]
+    rows, columns = np.indices(scene.shape)
+    frames = []
+    for log in logs:
+        # Variances are interpolated: those of Gaussians add up.
+        place = np.interp(np.square(middle * np.exp(spread * log)), np.square(STACK), np.arange(len(STACK)))
+        low = np.minimum(place.astype(int), len(STACK) - 2)
+        share = np.float32(place - low)
+        frames.append((1 - share) * stack[rows, columns, low] + share * stack[rows, columns, low + 1])
+    return _moved(scene, frames, _flows(count, scene.shape, rng, near=widths[1] > 4))
+
+
+def _near(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    return _mixed(scene, count, rng, (3.0, 8.0))
+
+
+def _none(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    flows = _flows(count, scene.shape, rng)
+    return _moved(scene, [scene] * count, flows * (rng.uniform() < 0.6))
+
+
+_SIMULATORS = {"screens": _screens, "kernels": _kernels, "lens": _lens, "mixed": _mixed, "near": _near, "none": _none}
+
+
+def _flows(count: int, shape: tuple[int, ...], rng: np.random.Generator, near: bool = False) -> FloatArray:
+    params = SmoothFlowParams(
+        rms=float(np.exp(rng.uniform(np.log(1.5), np.log(5)) if near else rng.uniform(np.log(0.1), np.log(2.2)))),
+        correlation_length=float(rng.uniform(16, 50) if near else rng.uniform(7, 30)),
+        persistence=float(rng.choice([0, 0.5, 0.9])),
+    )
+    return smooth_flows(count, *shape[:2], rng, params)
+
+
+def _moved(scene: FloatArray, frames: list[FloatArray], flows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Move blurred scenes, each by its flow, and the scene by their mean; leave the margin out."""
+    inner = np.s_[MARGIN:-MARGIN, MARGIN:-MARGIN]
+    moved = np.stack([warp(frame, flow)[inner] for frame, flow in zip(frames, flows, strict=True)])
+    return moved, warp(scene, flows.mean(0))[inner]
+
+
+def _wandering(
+    count: int, shape: tuple[int, ...], length: float, persistence: float, rng: np.random.Generator
+) -> FloatArray:
+    """Fields (count, H, W, n) of unit variance, smooth over a length in pixels, that follow an AR(1) process."""
+    height, width, kinds = shape
+    coarse = [int(np.ceil(side / length)) + 3 for side in (height, width)]
+    state, fields = rng.standard_normal((*coarse, kinds)), []
+    for _ in range(count):
+        size = coarse[1] * int(length), coarse[0] * int(length)
+        grown = cv2.resize(np.float32(state), size, interpolation=cv2.INTER_CUBIC)
+        fields.append(grown.reshape(*grown.shape[:2], kinds)[:height, :width])
+        state = persistence * state + np.sqrt(1 - persistence**2) * rng.standard_normal(state.shape)
+    return np.stack(fields)
+
+
+def record(frames: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Frames as a camera keeps them: noise, its reduction or sharpening, H.264 or HEVC, eight bits."""
+    noise = float(np.exp(rng.uniform(np.log(0.002), np.log(0.05))))
+    level = np.sqrt(np.maximum(frames, 0.02)) / 0.7 if rng.uniform() < 0.4 else 1.0
+    kind, grain = str(rng.choice(["white", "smooth", "reduced"], p=[0.6, 0.2, 0.2])), rng.standard_normal(frames.shape)
+    if kind == "smooth":
+        grain = np.stack([cv2.GaussianBlur(one, (0, 0), float(rng.uniform(0.5, 1.2))) for one in grain])
+        grain /= grain.std()
+    frames = np.clip(frames + noise * level * grain, 0, 1).astype(np.float32)
+    if kind == "reduced":
+        frames = np.stack([cv2.bilateralFilter(frame, 5, 3 * noise, 1.5) for frame in frames])
+    if rng.uniform() < 0.2:
+        width, much = float(rng.uniform(0.7, 1.5)), float(rng.uniform(0.2, 0.8))
+        frames = np.stack([frame + much * (frame - cv2.GaussianBlur(frame, (0, 0), width)) for frame in frames])
+    if rng.uniform() < 0.35:
+        even = tuple(side - side % 2 for side in frames.shape[1:])
+        coded = h264(frames[:, : even[0], : even[1]], int(rng.integers(18, 35)))
+        pad = [(0, 0), *((0, side - own) for side, own in zip(frames.shape[1:], even, strict=True))]
+        frames = np.pad(coded, pad, mode="edge")
+    return np.rint(255 * np.clip(frames, 0, 1)).astype(np.float32) / 255
