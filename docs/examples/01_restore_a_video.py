@@ -125,7 +125,8 @@ for decision in result.decisions:
 # %% [markdown]
 # ## The same in ten lines
 # Every stage is a function. The filter fuses frames in the geometry of the training frames; `recentred` moves its image
-# onto the mean geometry of all frames, and `recentre` does so with the centroid, which guides the deconvolution.
+# onto the mean geometry of all frames, and `recentre` does so with the centroid, which guides the deconvolution. The
+# weight λ of the data is the one that `restore` chose from the noise of the frames.
 
 # %%
 part = source.select(roi=(60, 0, 96, 96))
@@ -138,7 +139,8 @@ dynamics = tr.identify(centroid.flows)
 filtered = tr.filter_frames(frames, centroid.image, dynamics, known_flows=centroid.flows)
 straight = filtered.recentred()
 guide = tr.recentre(centroid.image, filtered.mean_flow)
-sharp = tr.deconvolve(straight.image, 1.0, guide=guide)
+weight = tr.DeconvolutionParams(fidelity=whole.deconvolution.fidelity)
+sharp = tr.deconvolve(straight.image, 1.0, weight, guide)
 print(dynamics)
 print(f"largest difference: filtered {np.abs(straight.image - whole.filtered.image).max():.1e}", end=", ")
 print(f"deblurred {np.abs(sharp.image - whole.image).max():.1e}")
