@@ -126,7 +126,7 @@ for decision in result.decisions:
 # ## The same in ten lines
 # Every stage is a function. The filter fuses frames in the geometry of the training frames; `recentred` moves its image
 # onto the mean geometry of all frames, and `recentre` does so with the centroid, which guides the deconvolution. The
-# weight λ of the data is the one that `restore` chose from the noise of the frames.
+# frames tell more of the noise than the image does.
 
 # %%
 part = source.select(roi=(60, 0, 96, 96))
@@ -139,8 +139,7 @@ dynamics = tr.identify(centroid.flows)
 filtered = tr.filter_frames(frames, centroid.image, dynamics, known_flows=centroid.flows)
 straight = filtered.recentred()
 guide = tr.recentre(centroid.image, filtered.mean_flow)
-weight = tr.DeconvolutionParams(fidelity=whole.deconvolution.fidelity)
-sharp = tr.deconvolve(straight.image, 1.0, weight, guide)
+sharp = tr.deconvolve(straight.image, 1.0, guide=guide, noise=whole.noise)
 print(dynamics)
 print(f"largest difference: filtered {np.abs(straight.image - whole.filtered.image).max():.1e}", end=", ")
 print(f"deblurred {np.abs(sharp.image - whole.image).max():.1e}")

@@ -182,6 +182,7 @@ def deconvolve(
     params: DeconvolutionParams | None = None,
     guide: ArrayLike | None = None,
     runtime: Runtime = DEFAULT,
+    noise: NoiseSpectrum | None = None,
 ) -> Deconvolution:
     """Deblur an image.
 
@@ -200,6 +201,9 @@ def deconvolve(
         paper uses the centroid.
     runtime : Runtime
         Threads and device.
+    noise : NoiseSpectrum, optional
+        Noise of the luminance, such as :attr:`turbrestore.Restoration.noise`; by default second differences of the
+        image tell how much white noise it has.
 
     Returns
     -------
@@ -221,7 +225,7 @@ def deconvolve(
     >>> bool(np.abs(result.image - square).mean() < 0.3 * np.abs(blurred - square).mean())
     True
     """
-    return finish(deconvolve_steps(image, sigma_or_psf, params, guide, runtime))
+    return finish(deconvolve_steps(image, sigma_or_psf, params, guide, runtime, spectrum=noise))
 
 
 def deconvolve_steps(
