@@ -10,6 +10,7 @@ duplicated frames     every value equals that of the frame before               
 blank frames          a tenth of the usual contrast or less: lens cap, flash, dropout    leaves them out
 overexposed frames    brighter, and with more white, than half of the frames              leaves them out
 cuts                  two frames are not similar under any shift                         keeps the longest scene
+turned frames         similar to the others once they are turned by 180°                 turns them back
 saturation            half of the values or more are white                               only warns
 ====================  =================================================================  =============================
 
@@ -22,6 +23,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 from array import array
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,12 +34,12 @@ from ...core.decision import Decision
 from ...core.errors import ConfigurationError, DataError, require_between
 from ...core.remarks import Doubt, counted
 from ...io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
-from ...io.source import FrameSource, numbers_text
+from ...io.source import FrameSource, Window, numbers_text
 from .black_borders import BlackBorderDetector, without_border
 from .missing_pixels import FEW_MISSING, MOST_MISSING, Backdrop, fill_holes, mean_backdrop
 from .overexposure import overexposed
 from .repeats import RepeatDetector
-from .scene_cuts import Scene, SceneDetector, group_scenes, thumbnail
+from .scene_cuts import MOST_SCENES, Scene, SceneDetector, group_scenes, thumbnail
 from .stuck_pixels import StuckPixelDetector, repair_stuck
 
 _LEAST_CONTRAST = 1 / 510
@@ -101,6 +103,8 @@ class ContentReport:
         Frames that are white where other frames show the scene.
     scenes : tuple of Scene
         In the order of their first frames; one where there is no cut.
+    turned : tuple of int
+        Frames that show the scene turned by 180°, as after the meridian flip of a telescope.
     saturated : float
         Mean share of white values.
     contrast : float
@@ -122,6 +126,7 @@ class ContentReport:
     blank: tuple[int, ...]
     overexposed: tuple[int, ...]
     scenes: tuple[Scene, ...]
+    turned: tuple[int, ...]
     saturated: float
     contrast: float
     left_out: frozenset[int]
@@ -152,7 +157,8 @@ def check_content(source: FrameSource, params: ContentParams | None = None) -> C
     for number, pixels, mosaic in zip(source.numbers, source.native(), source.mosaics(), strict=True):
         scan.update(number, pixels, mosaic)
     report = scan.report()
-    if params.strict and (report.left_out or report.filled or report.backdrop is not None or len(report.stuck)):
+    repaired = report.filled or report.turned or report.backdrop is not None or len(report.stuck)
+    if params.strict and (report.left_out or repaired):
         raise DataError(f"{source.name}: {report.warnings[0]}; refused by strict, leave it out to go on")
     return report
 
@@ -190,12 +196,31 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
             return with_planes(pixels, repair_stuck(planes_of(pixels), plane_places(stuck)))
         return repair_stuck(pixels, stuck) if len(stuck) else pixels
 
-    return dataclasses.replace(
+    cleaned = dataclasses.replace(
         cleaned,
         warnings=(*source.warnings, *report.warnings),
         repair=repaired if fill or len(stuck) else source.repair,
         unseen=source.unseen if backdrop is None or not backdrop.unseen.any() else backdrop.unseen,
     )
+    return _turned_back(cleaned, frozenset(report.turned)) if report.turned else cleaned
+
+
+def _turned_back(source: FrameSource, turned: frozenset[int]) -> FrameSource:
+    """Turn frames by 180° about the centre of the selected rows and columns, after they are repaired and developed."""
+    rows, columns = (slice(0, length) for length in source.file_shape[1:3])
+    whole = dataclasses.replace(source, window=(rows, columns))
+
+    def pixels(chosen: Sequence[int]) -> Iterator[PixelArray]:
+        for number, frame in zip(chosen, dataclasses.replace(whole, numbers=tuple(chosen)).native(), strict=True):
+            yield _turn(frame, source.window) if number in turned else frame
+
+    return dataclasses.replace(source, pixels=pixels, repair=None, develop=None)
+
+
+def _turn(frame: PixelArray, window: Window) -> PixelArray:
+    turned = frame.copy()
+    turned[window] = frame[window][::-1, ::-1]
+    return turned
 
 
 def _of_file(backdrop: Backdrop, source: FrameSource) -> Backdrop:
@@ -222,7 +247,7 @@ def keep_all(report: ContentReport) -> ContentReport:
     if backdrop is not None and len(report.scenes) > 1:
         # The backdrop is that of one scene; it must not show in the others.
         backdrop = dataclasses.replace(backdrop, black_borders=False)
-    nothing = dataclasses.replace(report, blank=(), overexposed=(), duplicated=(), left_out=frozenset())
+    nothing = dataclasses.replace(report, blank=(), overexposed=(), duplicated=(), turned=(), left_out=frozenset())
     kept = dataclasses.replace(nothing, scenes=report.scenes[:1], backdrop=backdrop)
     return dataclasses.replace(kept, warnings=tuple(_in_words(kept, False)))
 
@@ -286,7 +311,11 @@ class _ContentScan:
         blank = _are_blank(contrasts, self._params.blank_contrast)
         duplicated = np.isin(numbers, self._duplicated) | self._repeats.found()
         borders = self._borders.found()
-        labels = np.where(blank, -1, ((borders and self._bordered_scenes) or self._scenes).labels())
+        detector = (borders and self._bordered_scenes) or self._scenes
+        labels, turned = np.where(blank, -1, detector.labels()), detector.turned() & ~blank
+        if self._needs_backdrop or borders or self._source.unseen is not None:
+            # What frames lack is at another place of turned ones, so that they are a scene of their own.
+            labels, turned = np.where(turned, labels + MOST_SCENES, labels), np.zeros_like(turned)
         scenes, used = group_scenes(numbers, labels)
         left_out = blank | ~used
         # In a video of one repeated frame there are no others to use.
@@ -314,6 +343,7 @@ class _ContentScan:
             blank=tuple(numbers[blank].tolist()),
             overexposed=tuple(numbers[bright].tolist()),
             scenes=scenes,
+            turned=tuple(numbers[turned & ~left_out].tolist()),
             saturated=float(np.mean(self._white)),
             contrast=float(contrasts.max()),
             left_out=frozenset(numbers[left_out].tolist()),
@@ -378,6 +408,9 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
         used = f"{counted(longest.count, 'frame')} from {longest.first} to {longest.last}"
         choice = f"only the longest is used, {used}; to use another, select its frames ({others})"
         lines.append(Doubt(f"{len(report.scenes)} scenes: {choice}"))
+    if report.turned:
+        which = numbers_text(report.turned)
+        lines.append(f"{len(report.turned)} turned by 180°, as by the meridian flip of a mount: {which} turned back")
     if report.saturated >= _SATURATED:
         lines.append(f"{100 * report.saturated:.0f} % of the values are at white: detail there is lost")
     return lines
