@@ -16,6 +16,7 @@ class CheckKind(StrEnum):
     """
 
     INPUT = "input"  # guesses about the file, lost frames, scenes that are not used
+    WATERMARK = "watermark"
     SATURATED = "saturated"
     LARGE_MOTION = "large motion"
     SCENE_CHANGES = "scene changes"
