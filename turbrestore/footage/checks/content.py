@@ -23,7 +23,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 from array import array
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,17 +33,15 @@ from ...core.decision import Decision
 from ...core.errors import ConfigurationError, DataError, require_between
 from ...core.remarks import Doubt, counted
 from ...io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
-from ...io.source import FrameSource, Window, numbers_text
+from ...io.source import FrameSource, numbers_text
 from .black_borders import BlackBorderDetector, without_border
-from .missing_pixels import FEW_MISSING, MOST_MISSING, Backdrop, fill_holes, mean_backdrop
+from .missing_pixels import FEW_MISSING, MOST_MISSING, Backdrop, backdrop_of_file, fill_holes, mean_backdrop
 from .overexposure import overexposed
 from .repeats import RepeatDetector
-from .scene_cuts import MOST_SCENES, Scene, SceneDetector, group_scenes, thumbnail
+from .scene_cuts import MOST_SCENES, Scene, SceneDetector, group_scenes, thumbnail, turned_back
 from .stuck_pixels import StuckPixelDetector, repair_stuck
 
-_LEAST_CONTRAST = 1 / 510
-_SATURATED = 0.5
-_BLANK_CONTRAST = 0.1
+_LEAST_CONTRAST, _BLANK_CONTRAST, _SATURATED = 1 / 510, 0.1, 0.5
 
 
 @dataclass(frozen=True)
@@ -185,7 +182,7 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
     if report.numbers != source.numbers:
         raise ConfigurationError(f"{source.name}: the report is about other frames; check this selection")
     cleaned = source.without(report.left_out, "")
-    backdrop = None if report.backdrop is None else _of_file(report.backdrop, source)
+    backdrop = None if report.backdrop is None else backdrop_of_file(report.backdrop, source)
     fill, stuck, before = bool(report.filled) or backdrop is not None, report.stuck, source.repair
 
     def repaired(pixels: PixelArray) -> PixelArray:
@@ -202,34 +199,7 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
         repair=repaired if fill or len(stuck) else source.repair,
         unseen=source.unseen if backdrop is None or not backdrop.unseen.any() else backdrop.unseen,
     )
-    return _turned_back(cleaned, frozenset(report.turned)) if report.turned else cleaned
-
-
-def _turned_back(source: FrameSource, turned: frozenset[int]) -> FrameSource:
-    """Turn frames by 180° about the centre of the selected rows and columns, after they are repaired and developed."""
-    rows, columns = (slice(0, length) for length in source.file_shape[1:3])
-    whole = dataclasses.replace(source, window=(rows, columns))
-
-    def pixels(chosen: Sequence[int]) -> Iterator[PixelArray]:
-        for number, frame in zip(chosen, dataclasses.replace(whole, numbers=tuple(chosen)).native(), strict=True):
-            yield _turn(frame, source.window) if number in turned else frame
-
-    return dataclasses.replace(source, pixels=pixels, repair=None, develop=None)
-
-
-def _turn(frame: PixelArray, window: Window) -> PixelArray:
-    turned = frame.copy()
-    turned[window] = frame[window][::-1, ::-1]
-    return turned
-
-
-def _of_file(backdrop: Backdrop, source: FrameSource) -> Backdrop:
-    """Bring a backdrop of the selected rows and columns to the size of the frames in the file."""
-    values, black = np.zeros(source.file_shape[1:], np.float32), np.zeros(source.file_shape[1:], bool)
-    unseen = np.zeros(source.file_shape[1:3], bool)
-    values[source.window], black[source.window] = backdrop.values, backdrop.black
-    unseen[source.window] = backdrop.unseen
-    return dataclasses.replace(backdrop, values=values, unseen=unseen, black=black)
+    return turned_back(cleaned, frozenset(report.turned)) if report.turned else cleaned
 
 
 def without_blank(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
@@ -290,8 +260,7 @@ class _ContentScan:
                     self._bordered_scenes = copy.deepcopy(self._scenes)
                 shown = without_border(thumb, border, np.zeros_like(thumb) if self._shown is None else self._shown)
             self._shown = shown
-        contrast = float(thumb.std())
-        self._contrasts.append(contrast)
+        self._contrasts.append(contrast := float(thumb.std()))
         # A running estimate of the median, because blank frames must reach neither the scenes nor the stuck pixels.
         self._usual += 0.1 * (max(contrast, _LEAST_CONTRAST) - self._usual) if self._usual else contrast
         if contrast > max(_LEAST_CONTRAST, self._params.blank_contrast * self._usual):

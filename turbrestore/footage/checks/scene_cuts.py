@@ -14,7 +14,9 @@ a landscape of the Moon that turn midway, frames lie a quarter as far and are cl
 
 from __future__ import annotations
 
+import dataclasses
 from array import array
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -22,6 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray, luminance
+from ...io.pixels import PixelArray
+from ...io.source import FrameSource, Window
 
 _SIDE = 32
 # The picture has turned since the frame before where the other way round is closer by as much and at most so many times
@@ -126,6 +130,24 @@ def group_scenes(numbers: NDArray[np.int64], labels: NDArray[np.int32]) -> tuple
         return (Scene(int(numbers[0]), int(numbers[-1]), len(numbers)),), np.ones(len(numbers), bool)
     longest = max(scenes, key=lambda label: scenes[label].count)
     return tuple(scenes.values()), labels == longest
+
+
+def turned_back(source: FrameSource, turned: frozenset[int]) -> FrameSource:
+    """Turn frames by 180° about the centre of the selected rows and columns, after they are repaired and developed."""
+    rows, columns = (slice(0, length) for length in source.file_shape[1:3])
+    whole = dataclasses.replace(source, window=(rows, columns))
+
+    def pixels(chosen: Sequence[int]) -> Iterator[PixelArray]:
+        for number, frame in zip(chosen, dataclasses.replace(whole, numbers=tuple(chosen)).native(), strict=True):
+            yield _turn(frame, source.window) if number in turned else frame
+
+    return dataclasses.replace(source, pixels=pixels, repair=None, develop=None)
+
+
+def _turn(frame: PixelArray, window: Window) -> PixelArray:
+    turned = frame.copy()
+    turned[window] = frame[window][::-1, ::-1]
+    return turned
 
 
 def thumbnail(values: FloatArray) -> FloatArray:
