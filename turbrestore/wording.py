@@ -39,6 +39,7 @@ _CHECKS = {
         "a half-transparent mark lies over the scene and is restored poorly",
         "--roi X,Y,WIDTH,HEIGHT leaves it out; --static-mask FILE fills what it names, where the camera moves",
     ),
+    CheckKind.TWO_STATES: ("a part of the scene switches between two states, and the image may mix them", "{0}"),
     CheckKind.SATURATED: ("{0}", "expose shorter; ignore this where what is white has no detail"),
     CheckKind.LARGE_MOTION: ("{0}", "--frames FIRST:END with the frames that move less"),
     CheckKind.SCENE_CHANGES: (
