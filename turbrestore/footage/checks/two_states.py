@@ -33,7 +33,9 @@ def find_two_states(survey: Survey) -> tuple[Decision, ...]:
     frames = luminance(survey.small)
     count = len(frames)
     mean = frames.mean(axis=0)
-    sample = np.array([frames[place] - mean for place in spread(count, min(count, _SAMPLES))]).reshape(-1, mean.size)
+    sample = frames[spread(count, _SAMPLES)]
+    sample -= mean
+    sample = sample.reshape(len(sample), -1)
     energy, modes = np.linalg.eigh(sample @ sample.T)
     for column in range(1, min(_COMPONENTS, len(sample) - 1) + 1):
         if energy[-column] <= 0:
