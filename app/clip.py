@@ -89,4 +89,6 @@ def open_clip(path: Path, name: Path) -> Clip:
     whole, content = open_checked(path, Selection())
     cleaned = clean_source(whole, content)
     facts = describe_clip(cleaned, content)
-    return Clip(path, name, dataclasses.replace(whole, repair=cleaned.repair), facts)
+    # Frames that are left out can be shown as well.
+    shown = dataclasses.replace(whole, pixels=cleaned.pixels, repair=cleaned.repair, develop=cleaned.develop)
+    return Clip(path, name, shown, facts)

@@ -7,7 +7,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "config": ("turbrestore config --init run.toml", "turbrestore config --check run.toml"),
     "restore": (
         "turbrestore restore sample_data/chart.mkv sharp.png",
-        "turbrestore restore sample_data/chart.mkv part.png --frames 0:24 --roi 64,32,96,96 --sigma 1.2",
+        "turbrestore restore sample_data/chart.mkv part.png --roi 64,32,96,96",
         "turbrestore restore sample_data/chart.mkv quick.png --preset fast",
         "turbrestore restore sample_data/chart.mkv again.png --config sharp.png.toml",
         "turbrestore restore sample_data/chart.mkv all.png --keep stages --truth sample_data/chart_truth.png --json",

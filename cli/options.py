@@ -39,14 +39,14 @@ class Selection:
     max_pixels : int, optional
         Largest frame or image to read, pixels; by default 67 million.
     bayer : {"rggb", "grbg", "gbrg", "bggr"}, optional
-        Colours of the first pixels of a raw camera.  Grey frames are then taken for its raw frames.
+        Bayer pattern of raw frames, from the upper left.  Grey frames are then taken for those of a raw camera.
     hdr : {"sdr", "keep"}
-        Read HDR video (HLG, PQ) as the SDR picture, or keep its codes.  ``steady`` writes kept codes as tagged HDR.
+        Read HDR video as SDR, or keep its codes.  HLG and PQ are meant; ``steady`` writes kept codes as tagged HDR.
     dark : str, optional
         Frames taken with the lens covered.  A video, an image or a folder; their mean is subtracted, and hot pixels
         are filled.
     flat : str, optional
-        Frames of an even surface.  A video, an image or a folder; their mean is divided out.
+        Frames of an evenly lit surface.  A video, an image or a folder; their mean is divided out.
     crop_to_object : bool
         Follow a planet on a dark field.  Any bright object there will do; the window just holds it.
     axes : str, optional

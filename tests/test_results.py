@@ -48,6 +48,8 @@ def test_every_doubt_is_named_once_with_a_remedy(restoration):
     coarse = (np.indices((112, 112)) // 2).sum(axis=0) % 2
     doubts = {
         CheckKind.INPUT: {"decisions": (Decision("input", "", "cut short", CheckKind.INPUT),)},
+        CheckKind.WATERMARK: {"decisions": (Decision("overlay", "", "", CheckKind.WATERMARK),)},
+        CheckKind.TWO_STATES: {"decisions": (Decision("two states", "", "--frames 0:9", CheckKind.TWO_STATES),)},
         CheckKind.SATURATED: {"decisions": (Decision("saturation", "", "3% are white", CheckKind.SATURATED),)},
         CheckKind.LARGE_MOTION: {"decisions": (Decision("motion", "", "9 pixels", CheckKind.LARGE_MOTION),)},
         CheckKind.SCENE_CHANGES: {"is_mean": True, "structure": StructureReading(0.0, 0.6, 0.4)},

@@ -14,6 +14,7 @@ from .core.remarks import Doubt
 from .core.verdict import CheckKind
 from .footage.background import without_moving_objects
 from .footage.bars import Bars, without_bars
+from .footage.checks.two_states import find_two_states
 from .footage.levels import Levels, stretch_levels
 from .footage.lighting.light import steady_light
 from .footage.lighting.white_balance import steady_white_balance
@@ -63,6 +64,7 @@ def prepare(source: FrameSource, static_mask: str = "auto", scratch: Path | None
         hidden = unseen if hidden is None else hidden | unseen
     survey, colour_decisions = steady_white_balance(survey)
     survey, light_decisions = steady_light(survey)
+    state_decisions = find_two_states(survey)
     survey, levels, range_decisions = stretch_levels(survey)
     clip, object_decisions = without_moving_objects(survey) if static_mask != "off" else (survey.clip, ())
     decisions = (
@@ -77,6 +79,7 @@ def prepare(source: FrameSource, static_mask: str = "auto", scratch: Path | None
         *overlay_decisions,
         *colour_decisions,
         *light_decisions,
+        *state_decisions,
         *range_decisions,
         *object_decisions,
     )

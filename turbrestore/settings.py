@@ -33,9 +33,8 @@ class RestoreParams:
     Parameters
     ----------
     train : int, optional
-        Frames that the motion is learnt from.  Their number, from the first on; the centroid and the dynamics of the
-        flow are found from them.  By
-        default all of up to 40 frames, else half of them but at most 100.
+        Number of frames to learn the motion from.  They are the first ones, and tell the centroid and the dynamics of
+        the flow.  By default all of up to 40 frames, else half of them, but at least 40 and at most 100.
     until : {"centroid", "identify", "filter", "deconvolve"}
         Last stage to run.
     keep_best : float

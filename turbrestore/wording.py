@@ -35,6 +35,11 @@ _LARGE_MOTION = 1 / 12
 # What is doubtful, and what to do about it.
 _CHECKS = {
     CheckKind.INPUT: ("{0}", "ignore this if it is what you expect"),
+    CheckKind.WATERMARK: (
+        "a half-transparent mark lies over the scene and is restored poorly",
+        "--roi X,Y,WIDTH,HEIGHT leaves it out; --static-mask FILE fills what it names, where the camera moves",
+    ),
+    CheckKind.TWO_STATES: ("a part of the scene switches between two states, and the image may mix them", "{0}"),
     CheckKind.SATURATED: ("{0}", "expose shorter; ignore this where what is white has no detail"),
     CheckKind.LARGE_MOTION: ("{0}", "--frames FIRST:END with the frames that move less"),
     CheckKind.SCENE_CHANGES: (

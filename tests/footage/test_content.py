@@ -31,6 +31,17 @@ def elsewhere():
     return np.clip(make_sequence(4, count=14, size=64, scene="camera").frames, 0, 1).astype(np.float32)
 
 
+@pytest.fixture(scope="module")
+def planet():
+    """Disc with bands that resembles itself when it is turned; only its spot tells the way."""
+    y, x = np.mgrid[:64, :80]
+    disc = np.clip((20 - np.hypot(x - 42, y - 33)) / 2, 0, 1)
+    drawn = disc * (0.5 + 0.2 * np.sin(y / 2) + 0.15 * (np.hypot(x - 48, 1.6 * (y - 39)) < 4))
+    rng = np.random.default_rng(0)
+    shifted = [np.roll(drawn, rng.integers(-1, 2, 2), (0, 1)) for _ in range(16)]
+    return np.clip(shifted + rng.normal(0, 0.01, (16, 64, 80)), 0, 1).astype(np.float32)
+
+
 def cleaned(stack, **settings):
     source = FrameSource.from_array(stack, "clip")
     report = check_content(source, ContentParams(**settings))
@@ -318,6 +329,58 @@ def test_damaged_frames_are_refused_and_strictness_changes_nothing():
     source = FrameSource("a", "test", (5, 2, 2), 255, 8, lambda chosen: iter([np.zeros((2, 2), np.uint8)] * 3))
     with pytest.raises(DataError, match="expected 5 frames, found 3"):
         check_content(source)
+
+
+class TestTurnedFrames:
+    def flipped(self, stack, start=9):
+        return np.concatenate([stack[:start], stack[start:, ::-1, ::-1]])
+
+    @pytest.mark.parametrize("start", [5, 9])
+    def test_the_fewer_ones_are_turned_back_exactly(self, planet, start):
+        report, source = cleaned(self.flipped(planet, start))
+        assert len(report.scenes) == 1 and report.turned == (tuple(range(9, 16)) if start == 9 else tuple(range(5)))
+        np.testing.assert_array_equal(source.read(), planet if start == 9 else planet[:, ::-1, ::-1])
+        assert report.warnings[0].endswith("turned back")
+
+    def test_about_the_centre_of_the_region(self, planet):
+        stack = np.zeros((16, 100, 120), np.float32)
+        stack[:, 20:84, 30:110] = self.flipped(planet)
+        source = FrameSource.from_array(stack).select(roi=(30, 20, 80, 64))
+        found = clean_source(source, check_content(source))
+        np.testing.assert_array_equal(found.read(), planet)
+        np.testing.assert_array_equal(found.select(roi=(10, 5, 20, 15)).read(), planet[:, 5:20, 10:30])
+
+    def test_stuck_pixels_are_repaired_before(self, planet):
+        stack = self.flipped(planet)
+        stack[:, 50, 10] = 1
+        report, source = cleaned(stack)
+        assert report.stuck.tolist() == [[50, 10]] and len(report.turned) == 7
+        assert source.read().max() < 1
+
+    def test_they_are_a_scene_of_their_own_where_frames_lack_pixels(self, planet):
+        stack = self.flipped(planet)
+        stack[4, :10] = np.nan
+        report, source = cleaned(stack)
+        assert report.turned == () and [scene.count for scene in report.scenes] == [9, 7]
+        assert source.numbers == tuple(range(9))
+
+    @pytest.mark.parametrize("shape", ["point", "disc", "line"])
+    def test_what_looks_the_same_both_ways_is_not_turned(self, shape):
+        rng = np.random.default_rng(1)
+        y, x = np.mgrid[-50:50, -50:50]
+        frames = []
+        for dx, dy in rng.normal(0, 3, (60, 2)):
+            distance = np.abs(x - dx) if shape == "line" else np.hypot(x - dx, y - dy)
+            light = np.clip((30 - distance) / 2, 0, 1) if shape == "disc" else np.exp(-(distance**2) / 4)
+            frames.append(light + rng.normal(0, 0.03, light.shape))
+        assert cleaned(np.clip(np.float32(frames), 0, 1))[0].turned == ()
+
+    def test_strict_refuses_them_and_a_steadied_video_keeps_them(self, planet):
+        stack = self.flipped(planet)
+        with pytest.raises(DataError, match="7 turned by 180°"):
+            cleaned(stack, strict=True)
+        source = FrameSource.from_array(stack)
+        np.testing.assert_array_equal(clean_source(source, keep_all(check_content(source))).read(), stack)
 
 
 class TestBlankFrames:

@@ -16,6 +16,8 @@ class CheckKind(StrEnum):
     """
 
     INPUT = "input"  # guesses about the file, lost frames, scenes that are not used
+    WATERMARK = "watermark"
+    TWO_STATES = "two states"  # of a part of the scene
     SATURATED = "saturated"
     LARGE_MOTION = "large motion"
     SCENE_CHANGES = "scene changes"

@@ -10,6 +10,7 @@ duplicated frames     every value equals that of the frame before               
 blank frames          a tenth of the usual contrast or less: lens cap, flash, dropout    leaves them out
 overexposed frames    brighter, and with more white, than half of the frames              leaves them out
 cuts                  two frames are not similar under any shift                         keeps the longest scene
+turned frames         similar to the others once they are turned by 180°                 turns them back
 saturation            half of the values or more are white                               only warns
 ====================  =================================================================  =============================
 
@@ -34,15 +35,13 @@ from ...core.remarks import Doubt, counted
 from ...io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
 from ...io.source import FrameSource, numbers_text
 from .black_borders import BlackBorderDetector, without_border
-from .missing_pixels import FEW_MISSING, MOST_MISSING, Backdrop, fill_holes, mean_backdrop
+from .missing_pixels import FEW_MISSING, MOST_MISSING, Backdrop, backdrop_of_file, fill_holes, mean_backdrop
 from .overexposure import overexposed
 from .repeats import RepeatDetector
-from .scene_cuts import Scene, SceneDetector, group_scenes, thumbnail
+from .scene_cuts import MOST_SCENES, Scene, SceneDetector, group_scenes, thumbnail, turned_back
 from .stuck_pixels import StuckPixelDetector, repair_stuck
 
-_LEAST_CONTRAST = 1 / 510
-_SATURATED = 0.5
-_BLANK_CONTRAST = 0.1
+_LEAST_CONTRAST, _BLANK_CONTRAST, _SATURATED = 1 / 510, 0.1, 0.5
 
 
 @dataclass(frozen=True)
@@ -101,6 +100,8 @@ class ContentReport:
         Frames that are white where other frames show the scene.
     scenes : tuple of Scene
         In the order of their first frames; one where there is no cut.
+    turned : tuple of int
+        Frames that show the scene turned by 180°, as after the meridian flip of a telescope.
     saturated : float
         Mean share of white values.
     contrast : float
@@ -122,6 +123,7 @@ class ContentReport:
     blank: tuple[int, ...]
     overexposed: tuple[int, ...]
     scenes: tuple[Scene, ...]
+    turned: tuple[int, ...]
     saturated: float
     contrast: float
     left_out: frozenset[int]
@@ -152,7 +154,8 @@ def check_content(source: FrameSource, params: ContentParams | None = None) -> C
     for number, pixels, mosaic in zip(source.numbers, source.native(), source.mosaics(), strict=True):
         scan.update(number, pixels, mosaic)
     report = scan.report()
-    if params.strict and (report.left_out or report.filled or report.backdrop is not None or len(report.stuck)):
+    repaired = report.filled or report.turned or report.backdrop is not None or len(report.stuck)
+    if params.strict and (report.left_out or repaired):
         raise DataError(f"{source.name}: {report.warnings[0]}; refused by strict, leave it out to go on")
     return report
 
@@ -179,7 +182,7 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
     if report.numbers != source.numbers:
         raise ConfigurationError(f"{source.name}: the report is about other frames; check this selection")
     cleaned = source.without(report.left_out, "")
-    backdrop = None if report.backdrop is None else _of_file(report.backdrop, source)
+    backdrop = None if report.backdrop is None else backdrop_of_file(report.backdrop, source)
     fill, stuck, before = bool(report.filled) or backdrop is not None, report.stuck, source.repair
 
     def repaired(pixels: PixelArray) -> PixelArray:
@@ -190,21 +193,13 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
             return with_planes(pixels, repair_stuck(planes_of(pixels), plane_places(stuck)))
         return repair_stuck(pixels, stuck) if len(stuck) else pixels
 
-    return dataclasses.replace(
+    cleaned = dataclasses.replace(
         cleaned,
         warnings=(*source.warnings, *report.warnings),
         repair=repaired if fill or len(stuck) else source.repair,
         unseen=source.unseen if backdrop is None or not backdrop.unseen.any() else backdrop.unseen,
     )
-
-
-def _of_file(backdrop: Backdrop, source: FrameSource) -> Backdrop:
-    """Bring a backdrop of the selected rows and columns to the size of the frames in the file."""
-    values, black = np.zeros(source.file_shape[1:], np.float32), np.zeros(source.file_shape[1:], bool)
-    unseen = np.zeros(source.file_shape[1:3], bool)
-    values[source.window], black[source.window] = backdrop.values, backdrop.black
-    unseen[source.window] = backdrop.unseen
-    return dataclasses.replace(backdrop, values=values, unseen=unseen, black=black)
+    return turned_back(cleaned, frozenset(report.turned)) if report.turned else cleaned
 
 
 def without_blank(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
@@ -222,7 +217,7 @@ def keep_all(report: ContentReport) -> ContentReport:
     if backdrop is not None and len(report.scenes) > 1:
         # The backdrop is that of one scene; it must not show in the others.
         backdrop = dataclasses.replace(backdrop, black_borders=False)
-    nothing = dataclasses.replace(report, blank=(), overexposed=(), duplicated=(), left_out=frozenset())
+    nothing = dataclasses.replace(report, blank=(), overexposed=(), duplicated=(), turned=(), left_out=frozenset())
     kept = dataclasses.replace(nothing, scenes=report.scenes[:1], backdrop=backdrop)
     return dataclasses.replace(kept, warnings=tuple(_in_words(kept, False)))
 
@@ -265,8 +260,7 @@ class _ContentScan:
                     self._bordered_scenes = copy.deepcopy(self._scenes)
                 shown = without_border(thumb, border, np.zeros_like(thumb) if self._shown is None else self._shown)
             self._shown = shown
-        contrast = float(thumb.std())
-        self._contrasts.append(contrast)
+        self._contrasts.append(contrast := float(thumb.std()))
         # A running estimate of the median, because blank frames must reach neither the scenes nor the stuck pixels.
         self._usual += 0.1 * (max(contrast, _LEAST_CONTRAST) - self._usual) if self._usual else contrast
         if contrast > max(_LEAST_CONTRAST, self._params.blank_contrast * self._usual):
@@ -286,7 +280,11 @@ class _ContentScan:
         blank = _are_blank(contrasts, self._params.blank_contrast)
         duplicated = np.isin(numbers, self._duplicated) | self._repeats.found()
         borders = self._borders.found()
-        labels = np.where(blank, -1, ((borders and self._bordered_scenes) or self._scenes).labels())
+        detector = (borders and self._bordered_scenes) or self._scenes
+        labels, turned = np.where(blank, -1, detector.labels()), detector.turned() & ~blank
+        if self._needs_backdrop or borders or self._source.unseen is not None:
+            # What frames lack is at another place of turned ones, so that they are a scene of their own.
+            labels, turned = np.where(turned, labels + MOST_SCENES, labels), np.zeros_like(turned)
         scenes, used = group_scenes(numbers, labels)
         left_out = blank | ~used
         # In a video of one repeated frame there are no others to use.
@@ -314,6 +312,7 @@ class _ContentScan:
             blank=tuple(numbers[blank].tolist()),
             overexposed=tuple(numbers[bright].tolist()),
             scenes=scenes,
+            turned=tuple(numbers[turned & ~left_out].tolist()),
             saturated=float(np.mean(self._white)),
             contrast=float(contrasts.max()),
             left_out=frozenset(numbers[left_out].tolist()),
@@ -378,6 +377,9 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
         used = f"{counted(longest.count, 'frame')} from {longest.first} to {longest.last}"
         choice = f"only the longest is used, {used}; to use another, select its frames ({others})"
         lines.append(Doubt(f"{len(report.scenes)} scenes: {choice}"))
+    if report.turned:
+        which = numbers_text(report.turned)
+        lines.append(f"{len(report.turned)} turned by 180°, as by the meridian flip of a mount: {which} turned back")
     if report.saturated >= _SATURATED:
         lines.append(f"{100 * report.saturated:.0f} % of the values are at white: detail there is lost")
     return lines

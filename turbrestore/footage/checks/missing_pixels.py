@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray
 from ...io.pixels import PixelArray
+from ...io.source import FrameSource
 from .black_borders import black_border
 
 # Share of a frame that may be missing and is filled from around, and from which the frame shows too little.
@@ -101,3 +102,12 @@ def continued(values: FloatArray, known: NDArray[np.bool_]) -> FloatArray:
         missing &= ~near
         reach *= _WIDER
     return filled
+
+
+def backdrop_of_file(backdrop: Backdrop, source: FrameSource) -> Backdrop:
+    """Bring a backdrop of the selected rows and columns to the size of the frames in the file."""
+    values, black = np.zeros(source.file_shape[1:], np.float32), np.zeros(source.file_shape[1:], bool)
+    unseen = np.zeros(source.file_shape[1:3], bool)
+    values[source.window], black[source.window] = backdrop.values, backdrop.black
+    unseen[source.window] = backdrop.unseen
+    return replace(backdrop, values=values, unseen=unseen, black=black)

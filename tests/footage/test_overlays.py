@@ -1,0 +1,44 @@
+"""Words over the scene: opaque ones are kept, and those that the scene shows through are named."""
+
+import cv2
+import numpy as np
+import pytest
+
+from conftest import photograph, surveyed
+from turbrestore.core.verdict import CheckKind
+from turbrestore.footage.overlays import without_overlay
+from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
+
+SIDE, MARGIN = 160, 24
+
+
+def clip_behind_words(opacity: float, shake: float) -> np.ndarray:
+    """Frames of a cup, each moved by whole pixels, behind words that stay in place."""
+    rng = np.random.default_rng(3)
+    wide, count = photograph("coffee", SIDE + 2 * MARGIN), 40
+    shifts = MARGIN + np.clip(np.rint(rng.normal(0, shake, (count, 2))), -MARGIN, MARGIN).astype(int)
+    flows = smooth_flows(count, *wide.shape, rng, SmoothFlowParams(correlation_length=12))
+    bent = distort(wide, flows, rng, blur=1.0, noise=0.008)
+    frames = np.stack([frame[y : y + SIDE, x : x + SIDE] for frame, (x, y) in zip(bent, shifts, strict=True)])
+    word = np.zeros((SIDE, SIDE), np.uint8)
+    cv2.putText(word, "STOCK", (12, 95), cv2.FONT_HERSHEY_SIMPLEX, 1.4, 255, 5)
+    cover = opacity * np.float32(word) / 255
+    return np.rint(255 * np.clip(frames * (1 - cover) + cover, 0, 1)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("shake", [0, 2])
+def test_a_watermark_is_named_and_left_in_the_frames_where_the_camera_moves(shake):
+    survey = surveyed(clip_behind_words(0.35, shake))
+    after, hidden, title, decisions = without_overlay(survey)
+    assert [decision.check for decision in decisions] == [CheckKind.WATERMARK] and hidden is None
+    assert (title is None) == (after is survey) == (shake > 0)
+
+
+def test_an_opaque_title_is_kept_without_a_doubt():
+    _, hidden, title, decisions = without_overlay(surveyed(clip_behind_words(1.0, 0)))
+    assert title is not None and hidden is not None and [decision.check for decision in decisions] == [None]
+
+
+def test_a_clip_without_words_is_returned_as_it_is():
+    survey = surveyed(clip_behind_words(0.0, 0))
+    assert without_overlay(survey) == (survey, None, None, ())
