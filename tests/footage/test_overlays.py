@@ -26,12 +26,26 @@ def clip_behind_words(opacity: float, shake: float) -> np.ndarray:
     return np.rint(255 * np.clip(frames * (1 - cover) + cover, 0, 1)).astype(np.uint8)
 
 
-@pytest.mark.parametrize("shake", [0, 2])
+@pytest.mark.parametrize("shake", [0, 2, 4])
 def test_a_watermark_is_named_and_left_in_the_frames_where_the_camera_moves(shake):
     survey = surveyed(clip_behind_words(0.35, shake))
     after, hidden, title, decisions = without_overlay(survey)
     assert [decision.check for decision in decisions] == [CheckKind.WATERMARK] and hidden is None
     assert (title is None) == (after is survey) == (shake > 0)
+
+
+@pytest.mark.parametrize("level", [20, 255])
+def test_what_is_opaque_is_replaced_while_the_camera_moves(level):
+    """A title, and a dark stop that has the noise of the sensor."""
+    frames = clip_behind_words(0.0, 4)
+    if level == 20:
+        y, x = np.mgrid[: frames.shape[1], : frames.shape[2]]
+        stop = np.hypot(x - 80, y - 80) > 75
+        frames[:, stop] = np.random.default_rng(0).normal(level, 2, frames[:, stop].shape).round()
+    else:
+        frames[:, 90:110, 40:120] = level
+    _, hidden, title, decisions = without_overlay(surveyed(frames))
+    assert title is None and hidden is not None and [decision.check for decision in decisions] == [None]
 
 
 def test_an_opaque_title_is_kept_without_a_doubt():

@@ -55,6 +55,15 @@ class TestArrays:
         np.testing.assert_array_equal(np.rint(source.read() * 255), frames)
         assert len(source.warnings) == last
 
+    def test_square_frames_come_first_whatever_they_show(self, tmp_path):
+        """A disc beside the middle, turned by 180° in half of the frames: its planes along x are the most alike."""
+        y, x = np.mgrid[:60, :60]
+        disc = np.clip((18 - np.hypot(x - 34, y - 24)) / 2, 0, 1) * (0.6 + 0.3 * np.sin(y / 2))
+        frames = np.uint8(200 * np.stack([disc] * 10 + [disc[::-1, ::-1]] * 10))
+        np.save(tmp_path / "a.npy", frames)
+        source = open_frames(tmp_path / "a.npy")
+        assert source.shape == frames.shape and source.warnings == ()
+
     def test_axes_that_are_named(self, tmp_path):
         for axes in ("thwc", "tchw", "HWCT", "hwt"):
             names = axes.lower()

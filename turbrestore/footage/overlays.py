@@ -76,10 +76,10 @@ _NOISELESS, _DRAWN = 0.7, 1 / 8
 _LEAST_DRAWN, _BORDER = 1 / 3, 3
 # A part of a title has moved if edges with this share of its squared gradients are so many pixels from where they were.
 _MOVED, _MOTION = 0.5, 0.5
-# A title is half-transparent if less than this share of its pixels lacks noise.  On photographs of a cup and a person
-# behind words of an opacity of 0.35 or less, 0.02 or less does, as stored and with a static or a shaking camera; behind
-# opaque words of three styles, as stored and after H.264, 0.10 or more does.
-_SEEN_THROUGH = 0.05
+# What is static is half-transparent if less than this share of it, without its edges, lacks noise.  On photographs of a
+# cup, a person and bricks behind words of an opacity of 0.35 or less, 0.02 or less does, with a static or a shaking
+# camera; behind opaque words of three styles, as stored and after H.264, 0.05 or more does.
+_SEEN_THROUGH = 0.03
 # Strokes of a clock: largest change of a pixel that stays, in units of the noise and in grey levels; least share of
 # the frames that have an edge there, and of these in which it stays; fewest connected pixels.
 _SAME, _LEAST_SAME, _OFTEN, _REMAINS, _FEWEST_STROKES = 1.0, 1.5, 0.2, 0.25, 12
@@ -200,14 +200,17 @@ def without_overlay(
     shifts *= (mask.shape[1] / small.shape[2], mask.shape[0] / small.shape[1])
     if not given and float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) < _LEAST_MOTION:
         return (survey, None, None, ()) if title is None else _with_title_kept(survey, small, title)
+    reason = "the scene moves behind it and shows through it"
+    left = Decision("overlay", "left in the frames", reason, CheckKind.WATERMARK)
     if titles_only or seen_through:
-        reason = "the scene moves behind it and shows through it"
-        left = Decision("overlay", "left in the frames", reason, CheckKind.WATERMARK)
         return survey, None, None, (left,) if seen_through else ()
     if moments is not None and not given:
         mask, _ = _static_regions(survey.clip, moments, level, shifts)
         if mask is None:
             return survey, None, None, ()
+        constant = np.sqrt(moments.variance) < _CONSTANT * max(moments.noise, level / _STILL)
+        if _is_seen_through(mask, luminance(moments.mean), constant, _AROUND):
+            return survey, None, None, (left,)
         mask, _ = _with_digits(mask, None, digits & _around(mask, len(mask) // _LINE))
     overlay = _overlay(survey, mask, shifts)
     choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced by what other frames show"
@@ -264,8 +267,15 @@ def _static_regions(
     if not drawn.any() or measured < _LEAST_BENDING:
         return mask, None
     letters = _around(_with_gaps(_regions((constant & _around(drawn, _NEAR)) | drawn, drawn)) > 0, 1)
-    inner = cv2.erode(letters.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return mask, Title(letters, moments.mean, source.window, float(constant[inner].mean()) < _SEEN_THROUGH)
+    return mask, Title(letters, moments.mean, source.window, _is_seen_through(letters, mean, constant, 1))
+
+
+def _is_seen_through(mask: NDArray[np.bool_], mean: FloatArray, constant: NDArray[np.bool_], edge: int) -> bool:
+    """Tell whether hardly any static pixel lacks noise, apart from the edge; a stop has noise too, but is dark."""
+    inner = ~_around(~mask, edge)
+    if not inner.any() or float(constant[inner].mean()) >= _SEEN_THROUGH:
+        return False
+    return float(mean[mask].mean()) > float(continued(mean, ~mask)[mask].mean())
 
 
 def _grey_level(survey: Survey, moments: Moments) -> float:

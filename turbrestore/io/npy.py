@@ -170,6 +170,8 @@ def _frames_first(path: Path, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
         array.ndim == 3
         and min(shape[:2]) >= _LEAST_SIDE
         and shape[2] > 1
+        # Only square frames make the last two axes, and no others, equally long.
+        and not shape[0] != shape[1] == shape[2]
         and array.dtype.kind in "iuf"
         and _frames_last(array)
     ):
