@@ -168,3 +168,8 @@ def halves_memory(shape: tuple[int, ...], threads: int) -> float:
     values = float(np.prod(shape))
     # Six halves, and registered frames of which some wait in each thread; the flow and the frame read.
     return 4 * values * (6 + 2 * (threads + 1)) + 8.0 * shape[0] * shape[1]
+
+
+def kept_halves_memory(shape: tuple[int, ...]) -> float:
+    """Bytes of a :class:`HalvedClip` for frames of (H, W) or (H, W, 3) pixels: its four means."""
+    return 16 * float(np.prod(shape))
