@@ -57,6 +57,11 @@ def test_noise_of_a_frame_and_of_the_mean_agree_where_frames_are_independent(fra
         assert pair.noise().deviation * np.sqrt(COUNT) == pytest.approx(NOISE, rel=0.1)
 
 
+def test_a_frame_that_others_are_registered_to_has_noise_of_its_own(frames):
+    found = noise_of_frames(frames[1:], still(COUNT - 1), frames[0], is_mean=False)
+    assert found.deviation == pytest.approx(NOISE, rel=0.1)
+
+
 def test_texture_that_lasts_shows_in_beginning_and_end_only():
     rng, scene, state, frames = np.random.default_rng(1), SCENES["camera"](*SHAPE), None, []
     for _ in range(COUNT):

@@ -52,16 +52,17 @@ _FEWEST, _AROUND = 8, 2
 _LARGEST, _TEXTURE = 0.6, 0.8
 
 
-def noise_of_frames(frames: Frames, flows: Frames, mean: FloatArray) -> NoiseSpectrum:
-    """Spectrum of the noise of a frame, by frames (H, W[, 3]) registered by their flows (H, W, 2) and their mean.
+def noise_of_frames(frames: Frames, flows: Frames, image: FloatArray, is_mean: bool = True) -> NoiseSpectrum:
+    """Spectrum of the noise of a frame, by frames (H, W[, 3]) registered to an image by their flows (H, W, 2).
 
-    ``mean`` (H, W[, 3]).
+    ``image`` (H, W[, 3]) is the mean of the frames, or one of them.
     """
-    grey, count = luminance(mean), len(frames)
+    grey, count = luminance(image), len(frames)
     picked = np.unique(np.linspace(0, count - 1, min(count, _FRAMES)).round().astype(int))
     residuals = (luminance(warp(frames[number], flows[number])) - grey for number in picked)
-    # The mean contains a part of the noise of each frame.
-    return fit_noise_spectrum(residuals, grey).scaled(count / max(count - 1, 1))
+    # The mean contains a part of the noise of each frame; one frame has as much noise as the next.
+    share = count / max(count - 1, 1) if is_mean else 0.5
+    return fit_noise_spectrum(residuals, grey).scaled(share)
 
 
 @dataclass(frozen=True, eq=False)
