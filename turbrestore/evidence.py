@@ -119,7 +119,9 @@ def _of_optics(known: BlurWitnesses, run: Run, seeing: Seeing | None) -> BlurWit
     return replace(known, displacement=implied, diffraction=diffraction, spread=float(spread))
 
 
-def agreed_image(run: Run, done: Deconvolution, posterior: BlurPosterior, halves: HalvedClip) -> Guarded:
+def agreed_image(
+    run: Run, done: Deconvolution, posterior: BlurPosterior, halves: HalvedClip, photons: NoiseCurve | None
+) -> Guarded:
     """Compare the halves of the clip behind the deconvolution of the image, and keep what they agree on."""
     exponent = run.params.deconvolution.exponent or posterior.exponent
 
@@ -131,7 +133,7 @@ def agreed_image(run: Run, done: Deconvolution, posterior: BlurPosterior, halves
         pairs = halves.alternate, halves.lasting
         sharp = [Halves(sharpened(pair.first), sharpened(pair.second)) for pair in pairs]
         full_scale = run.prepared.levels.full_scale
-        return keep_agreed(done.image, halves.alternate.mean, halves.noise, sharp, full_scale)
+        return keep_agreed(done.image, halves.alternate.mean, halves.noise, sharp, full_scale, photons)
 
 
 def measure_photon_noise(run: Run, halves: Halves) -> NoiseCurve | None:
