@@ -19,8 +19,8 @@ scene is still in the lower ones.
 Near an edge the windows of the bands hold the edge, on which the halves agree, and a ring behind it is not noticed.
 Flat parts are therefore looked at once more in small windows with sharp borders: where the mean varies by no more than
 its noise in a window that ends before the edge, the scene is flat to within the noise, and what the result varies by
-beyond the mean is rings or noise.  There all of the image is the mean's, even if the halves agree: deblurred alike, they
-have the same rings.
+beyond the mean is rings or noise.  There all of the image is the mean's, even if the halves agree: deblurred alike,
+they have the same rings.
 
 What is left of the colours below the bands is that of the mean where it differs by more than two grey levels: weights
 may have preferred a frame that is tinted.
