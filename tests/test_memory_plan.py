@@ -162,3 +162,10 @@ def test_two_gigabytes_are_enough_for_full_hd():
     assert plan_of(FULL_HD, 2e9).tile is None
     assert least_limit((300, 4320, 7680)) < 8e9
     assert replace(plan_of(FULL_HD, 2e9), decisions=()).train == 60
+
+
+def test_the_halves_that_the_result_is_compared_with_count():
+    shape, given = (24, 2160, 3840, 3), DeconvolutionParams(sigma=20.0)
+    found, asked = (least_limit(shape, deconvolution=one) for one in (DeconvolutionParams(), given))
+    # A width that is given is compared with nothing.
+    assert found - asked > 12 * np.prod(shape[1:])

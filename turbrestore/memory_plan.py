@@ -35,7 +35,7 @@ from .filtering.filter_records import filter_memory
 from .footage.survey import survey_memory, survey_scratch_bytes
 from .registration.flow import MIN_SIDE
 from .registration.flow_methods.opencv_flow import flow_memory
-from .registration.registered_noise import halves_memory
+from .registration.registered_noise import halves_memory, kept_halves_memory
 from .runtime.device import TORCH_BYTES, find_device, needs_torch
 from .runtime.jit import COMPILER_BYTES
 from .runtime.memory_size import size_text
@@ -207,13 +207,14 @@ def _peak(shape: tuple[int, ...], params: RestoreParams, choice: _Choice, budget
     results = _held_by_deconvolution(shape, params, choice)
     prepared = _pixels(shape) * float(_PREPARED + _PREPARED_COLOUR * _channels(shape))
     prepared += survey_memory(shape, choice.in_scratch)
-    deblurred = results + max(remove_blur_memory(shape[1:], params.deconvolution, side), keep_agreed_memory(shape[1:]))
-    halves = held + halves_memory(shape[1:], threads)
+    deblurring = max(remove_blur_memory(shape[1:], params.deconvolution, side), keep_agreed_memory(shape[1:]))
+    # The halves of the clip are of whole frames in any case.
+    filtering = max(flow + filter_memory(part, train, params.filter, threads), halves_memory(shape[1:], threads))
     stages = {
         "centroid": max(held + flow, prepared),
         "identify": held + modes + identify_memory(part, train),
-        "filter": held + modes + flow + filter_memory(part, train, params.filter, threads),
-        "deconvolve": max(deblurred, halves),
+        "filter": held + modes + filtering,
+        "deconvolve": results + _kept_halves(shape, params) + deblurring,
     }
     finer = 0.0 if params.scale == 1 else results + _on_finer_grid(shape, params, threads)
     return max(finer, results + _report(shape), *(size for name, size in stages.items() if params.runs(name)))
@@ -231,7 +232,9 @@ def _deconvolution_side(shape: tuple[int, ...], params: RestoreParams, choice: _
 
     It is the same where they are in memory, so that the result does not depend on the number of threads.
     """
-    left = budget - _held_by_deconvolution(shape, params, replace(choice, in_scratch=True))
+    left = (
+        budget - _held_by_deconvolution(shape, params, replace(choice, in_scratch=True)) - _kept_halves(shape, params)
+    )
     size = shape[1], shape[2]
     sides = range(max(size) - _SIDE_STEP, SMALLEST_SIDE, -_SIDE_STEP)
     for side in (None, *sides):
@@ -254,6 +257,11 @@ def _held_by_deconvolution(shape: tuple[int, ...], params: RestoreParams, choice
         return _pixels(shape) * float(_RESULTS_OF_TILES + _RESULTS_OF_TILES_COLOUR * _channels(shape))
     held = _pixels(shape) * float(_RESULTS + _RESULTS_COLOUR * _channels(shape))
     return held if choice.in_scratch else held + sum(_stack(shape, params, choice.train)[1:])
+
+
+def _kept_halves(shape: tuple[int, ...], params: RestoreParams) -> float:
+    """Bytes of the halves that the result is compared with, where the width of the blur is not given."""
+    return kept_halves_memory(shape[1:]) if params.finds_blur else 0.0
 
 
 def _scratch_bytes(shape: tuple[int, ...], params: RestoreParams, choice: _Choice) -> int:

@@ -204,8 +204,8 @@ def _deblur_and_crop(run: Run, fused: Restoration, evidence: Evidence, psf: NDAr
         deblurred = run.stage("deconvolve", "deblurred", lambda: _remove_blur(run, fused, evidence, psf, photons))
         run.decide(*deblurred.decisions)
         image = deblurred.deconvolution.image
-        if halves is not None:
-            agreed = agreed_image(run, fused, deblurred, halves)
+        if halves is not None and deblurred.posterior is not None:
+            agreed = agreed_image(run, deblurred.deconvolution, deblurred.posterior, halves, photons)
             run.decide(*agreed.decisions)
             image = agreed.image
     seen = coverage(fused.centroid.flows)

@@ -117,7 +117,8 @@ class Restoration:
         Share, 0 to 1, of the mean of the registered frames in the image: where they do not agree on its detail or
         colour, and in flat parts that ring or are noisy; None unless the image was deblurred.
     noise : NoiseSpectrum or None
-        Noise of the filtered image at every frequency; None unless a blur is looked for.
+        Noise of the luminance of the filtered image at every frequency; None unless the filter has run, and where the
+        mean of the frames is the result.
     structure : StructureReading or None
         How far the registered frames agree with the filtered image.
     is_mean : bool
@@ -241,7 +242,7 @@ def _checks(restoration: Restoration, motion: float) -> Iterator[Check]:
         yield write_check(CheckKind.REPETITION, period, largest)
     error = of_air * mean_flow_error(restoration.dynamics, int(np.isfinite(filtered.sharpness).sum()))
     if restoration.frame_count < _FEW:
-        yield write_check(CheckKind.FEW_FRAMES, counted(restoration.frame_count, "frame"))
+        yield write_check(CheckKind.FEW_FRAMES, counted(restoration.frame_count, "frame"), error, _FEW)
     elif error > _SEEN_BEND:
         yield write_check(CheckKind.GEOMETRY, error, counted(restoration.frame_count, "frame"))
     if structure is not None and structure.left > _HALF:

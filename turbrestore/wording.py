@@ -24,10 +24,6 @@ from .seeing.strength import LARGEST_BLUR, Estimate, Seeing
 _COUNTS = 0.2
 # Share of saturated pixels above which they are reported.
 _REPORTED_SHARE = 0.01
-# Fewest frames that are deblurred.  Where the air moves the scene by 1.5 pixels and hardly changes between frames that
-# follow each other, the mean of fewer is off by more than a pixel: a photograph behind a blur of 1 pixel loses 0.4 to
-# 1.8 dB when it is deblurred, and gains from five frames on.
-FEW_FRAMES = 5
 # Motion beyond this share of the shorter side is too large for optical flow in some places.
 _LARGE_MOTION = 1 / 12
 
@@ -54,7 +50,10 @@ _CHECKS = {
         "the scene repeats every {0:.1f} pixels and moves by {1:.1f}, so parts may have slipped by one repetition",
         "take the mean of the frames if lines are broken that are whole there",
     ),
-    CheckKind.FEW_FRAMES: ("{0} average out neither the motion nor the noise", "use at least eight"),
+    CheckKind.FEW_FRAMES: (
+        "{0} average out neither the motion nor the noise, and tell the geometry to {1:.1f} pixels only",
+        "use at least {2}",
+    ),
     CheckKind.GEOMETRY: (
         "lines may be bent, because {1} tell the geometry to {0:.1f} pixels only",
         "use more frames; ignore this if only sharpness matters",
@@ -231,15 +230,13 @@ def explain_structure(reading: StructureReading) -> tuple[Decision, ...]:
     return (Decision("structure", "the mean of the frames is the result", reason),)
 
 
-def explain_few_frames(count: int) -> tuple[Decision, ...]:
+def explain_few_frames(count: int, fewest: int) -> Decision:
     """Say that so few frames are not deblurred."""
-    if count >= FEW_FRAMES:
-        return ()
     reason = (
         f"{counted(count, 'frame')} do not tell where in the image the scene lies, and sharp edges in wrong places are "
-        f"worse than blurred ones; take {FEW_FRAMES} frames or more, or set the width to remove (--sigma)"
+        f"worse than blurred ones; take {fewest} frames or more, or set the width to remove (--sigma)"
     )
-    return (Decision("few frames", "no blur is removed", reason),)
+    return Decision("few frames", "no blur is removed", reason)
 
 
 def explain_seeing(seeing: Seeing) -> tuple[Decision, ...]:

@@ -6,6 +6,8 @@ import numpy as np
 from turbrestore.agreement import last_guard
 from turbrestore.agreement.last_guard import keep_agreed
 from turbrestore.core.arrays import luminance
+from turbrestore.core.noise import NoiseCurve
+from turbrestore.core.noise_spectrum import RINGS, NoiseSpectrum
 from turbrestore.metrics import psnr
 from turbrestore.registration.registered_noise import Halves
 from turbrestore.synthesis.scenes import SCENES
@@ -94,6 +96,15 @@ def test_rings_behind_an_edge_in_a_flat_part_give_way_and_the_edge_stays():
     np.testing.assert_array_equal(guarded.image[:, 39:41], ringing[:, 39:41])
 
 
+def test_rings_that_the_deblurred_halves_share_give_way_in_a_flat_part():
+    scene, halves, flat = plate(noise=0.002)
+    distance = np.abs(np.arange(96) - 39.5)
+    rings = np.float32(0.03 * np.cos(np.pi * distance / 2.5) * np.exp(-distance / 8) * (distance > 2))
+    shared = Halves(halves.first + rings, halves.second + rings)
+    guarded = keep_agreed(scene + rings, halves.mean, halves.noise(), [shared])
+    assert np.abs(guarded.image - scene)[:, flat].max() < 0.5 * np.abs(rings[flat]).max()
+
+
 def test_a_sharp_result_without_rings_stays():
     scene, halves, _ = plate(noise=0.002)
     assert np.abs(guarded_by(scene, halves).image - scene).max() < 2e-3
@@ -148,3 +159,24 @@ def test_smooth_noise_in_flat_parts_is_that_of_the_mean():
     guarded = guarded_by(result, halves)
     flat = np.s_[:, :50]
     assert guarded.image[flat].std() < 1.25 * halves.mean[flat].std()
+
+
+def test_dark_parts_are_as_flat_as_the_noise_of_photons_there():
+    rng, shape = np.random.default_rng(8), (96, 192)
+    scene = np.full(shape, 0.1, np.float32)
+    scene[:, 96:] = 0.9
+    # Faint detail where it is dark, weaker than the average noise and stronger than that of dark parts.
+    scene[:, :96] += 0.012 * np.sign(np.sin(np.arange(96) * np.pi / 2 + 0.1)).astype(np.float32)
+    deviation = np.where(np.arange(192) < 96, 0.002, 0.03).astype(np.float32)
+    halves = Halves(*(scene + deviation * rng.standard_normal(shape).astype(np.float32) for _ in range(2)))
+    mean, photons = halves.mean, NoiseCurve(np.array([0.1, 0.9]), np.array([2 / 226, 2 * 225 / 226]))
+    # Detail that is twice as strong, and noise that is.
+    result = np.float32(mean + np.where(np.arange(192) < 96, scene - 0.1, mean - scene))
+    noise = NoiseSpectrum(
+        np.full(RINGS.size, np.square(deviation).mean() / 2), np.zeros(RINGS.size), np.zeros(RINGS.size)
+    )
+    one, by_level = (keep_agreed(result, mean, noise, [halves], photons=curve) for curve in (None, photons))
+    dark, bright = np.s_[16:-16, 16:80], np.s_[16:-16, 112:-16]
+    assert np.abs(by_level.image - result)[dark].max() < 0.003
+    assert np.abs(one.image - result)[dark].mean() > 0.009
+    assert by_level.image[bright].std() < 1.25 * mean[bright].std()

@@ -64,6 +64,9 @@ def test_the_deviation_is_that_of_a_pixel():
     flat = NoiseSpectrum(np.full_like(RINGS, 4e-4), np.zeros_like(RINGS), np.zeros_like(RINGS))
     assert flat.deviation == pytest.approx(0.02)
     assert flat.scaled(0.25).deviation == pytest.approx(0.01)
+    # e is a ratio, which the levels do not change.
+    doubled = NoiseSpectrum(flat.power, flat.error, np.full_like(RINGS, 0.6)).scaled(4)
+    np.testing.assert_array_equal(doubled.relative, 0.6)
     np.testing.assert_allclose(flat.at(np.array([0.0, 0.3, 0.7])), 4e-4)
 
 

@@ -10,7 +10,12 @@ from skimage import data
 from small_problems import dense, dense_blur, small_problem
 
 from turbrestore.blur.psf import blur_otf, laplacian_symbol, psf_to_otf
-from turbrestore.deconvolution.conjugate_gradient import ConjugateGradients, quadratic_solver, wiener_fidelity
+from turbrestore.deconvolution.conjugate_gradient import (
+    ConjugateGradients,
+    quadratic_solver,
+    wiener_fidelity,
+    wiener_filtered,
+)
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.deconvolution.tv import local_gradient
 
@@ -100,3 +105,25 @@ def test_wiener_fidelity_falls_with_noise_and_rises_with_contrast():
     image = data.camera()[60:124, 120:184].astype(np.float32) / 255
     assert wiener_fidelity(image, 0.01) < wiener_fidelity(image, 0.001)
     assert wiener_fidelity(image / 2, 0.001) < wiener_fidelity(image, 0.001)
+
+
+@pytest.mark.parametrize("exponent", [5 / 3, 2.0])
+@pytest.mark.parametrize("cycles", [(3, 0), (0, 8), (6, 10)])
+def test_a_wave_behind_wieners_filter_has_the_amplitude_of_its_formula(cycles, exponent):
+    # Whole half-cycles from border to border go on by reflection.
+    angles = [np.pi * count * (np.arange(64) + 0.5) / 64 for count in cycles]
+    image = np.float32(0.5 + 0.2 * np.outer(np.cos(angles[0]), np.cos(angles[1])))
+    sigma, noise = 1.5, 0.01
+    found = wiener_filtered(image, sigma, exponent, noise)
+    nu = np.array(cycles) / 128
+    otf = np.exp(-np.log(2) * (np.hypot(*nu) * np.pi * sigma / np.sqrt(np.log(2) / 2)) ** exponent)
+    laplacian = np.sum(4 * np.sin(np.pi * nu) ** 2)
+    gain = otf / (otf**2 + laplacian / wiener_fidelity(image, noise))
+    inside = np.s_[12:-12, 12:-12]
+    assert found[inside] == pytest.approx((0.5 + gain * (image - 0.5))[inside], abs=0.01)
+
+
+def test_wieners_filter_of_less_noise_is_sharper():
+    image = cv2.GaussianBlur(data.camera()[60:188, 120:248].astype(np.float32) / 255, (0, 0), 1.5)
+    less, more = (np.abs(np.diff(wiener_filtered(image, 1.5, 2.0, noise))).mean() for noise in (0.002, 0.05))
+    assert less > more > 1.1 * np.abs(np.diff(image)).mean()

@@ -11,7 +11,9 @@ from blurred_images import camera, psnr
 from small_problems import gaussian_psf
 
 from turbrestore.blur.estimation import BlurEstimate
+from turbrestore.blur.psf import half_frequency
 from turbrestore.core.errors import ConfigurationError, DataError
+from turbrestore.core.noise_spectrum import RINGS, NoiseSpectrum
 from turbrestore.deconvolution.deconvolve import (
     BOUNDARIES,
     METHODS,
@@ -268,3 +270,18 @@ def test_the_width_may_stand_in_the_settings():
     assert np.array_equal(deconvolve(image, params=params).image, deconvolve(image, 1.3, params).image)
     with pytest.raises(ConfigurationError, match="expected a blur here or in params.sigma, found neither"):
         deconvolve(image)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_smooth_noise_that_is_certain_weakens_the_data(method):
+    image = cv2.GaussianBlur(SCENES["camera"](64, 64), (0, 0), 1.5)
+    params = DeconvolutionParams(method=method, iterations=1)
+    # Second differences do not see noise of 3 % that is as smooth as that.
+    power = 0.03**2 * 4 * np.pi * 1.5**2 * np.exp(-((2 * np.pi * 1.5 * RINGS) ** 2))
+    certain, doubtful = (NoiseSpectrum(power, share * power, np.zeros(RINGS.size)) for share in (0.05, 0.6))
+    plain, less, same = (
+        finish(deconvolve_steps(image, 1.5, params, spectrum=spectrum)) for spectrum in (None, certain, doubtful)
+    )
+    assert same.fidelity == plain.fidelity and same.noise == plain.noise
+    assert less.fidelity < 0.5 * plain.fidelity
+    assert less.noise == pytest.approx(np.sqrt(0.9 * np.interp(half_frequency(1.5), RINGS, power)), rel=0.01)

@@ -2,8 +2,9 @@ import cv2
 import numpy as np
 import pytest
 
+from turbrestore.core.noise_spectrum import RINGS, NoiseSpectrum
 from turbrestore.filtering.frame_noise import frame_noise_variance, invalid_mask, local_sharpness, project_gradient
-from turbrestore.filtering.frame_statistics import measure_frame_statistics
+from turbrestore.filtering.frame_statistics import _coloured, measure_frame_statistics
 from turbrestore.registration.warp import inside
 
 SHAPE = (200, 210)
@@ -153,3 +154,13 @@ def test_the_score_hardly_knows_the_noise_of_its_own_pixel(model_and_frames):
         scores = [local_sharpness(projection, 3.0, left_out) for left_out in (0.0, 0.25)]
         shifts += [-float((noise * score * laplacian)[INSIDE].sum()) for score in scores]
     assert 0 < shifts[1] < 0.4 * shifts[0]
+
+
+def test_where_no_noise_is_certain_it_is_taken_for_white(model_and_frames):
+    template, power = model_and_frames[0].template, np.full(RINGS.size, 1e-4)
+    error = np.where(RINGS < 0.3, power, 0.05 * power)
+    guessed = _coloured(template, NoiseSpectrum(power, error, np.zeros(RINGS.size)))
+    np.testing.assert_allclose(guessed, template, atol=0.02 * np.abs(template).max())
+    # What is certain counts: noise without high frequencies has more power at the low ones, where the template is.
+    smooth_noise = NoiseSpectrum(1e-4 * np.exp(-((8 * RINGS) ** 2)), np.zeros(RINGS.size), np.zeros(RINGS.size))
+    assert np.square(_coloured(template, smooth_noise)).mean() > 1.5 * np.square(template).mean()

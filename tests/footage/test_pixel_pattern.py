@@ -51,6 +51,15 @@ def test_a_pattern_that_changes_is_subtracted_from_the_frames_that_have_it(frame
         assert np.std((found.clip.read() - many)[part].mean(axis=0)) < 0.35 * 0.015
 
 
+@pytest.mark.parametrize(("count", "left_of_noise"), [(1, 0.7), (30, 1.1)])
+def test_little_of_the_noise_of_few_frames_is_taken_for_a_pattern(count, left_of_noise):
+    offsets, rng = pattern(1), np.random.default_rng(5)
+    # As strong as the offsets in one frame.
+    noise = np.float32(0.015 / np.sqrt(count) * rng.standard_normal((SIDE, SIDE)))
+    found = _white_part(0.5 + offsets + noise, float(noise.var()))
+    assert np.square(found - offsets).mean() < left_of_noise * np.square(noise).mean()
+
+
 def test_frames_without_a_pattern_are_left(frames):
     survey = surveyed(frames)
     assert without_pixel_pattern(survey, measure_moments(survey)) == (survey, ())

@@ -57,6 +57,11 @@ def test_noise_of_a_frame_and_of_the_mean_agree_where_frames_are_independent(fra
         assert pair.noise().deviation * np.sqrt(COUNT) == pytest.approx(NOISE, rel=0.1)
 
 
+def test_a_frame_that_others_are_registered_to_has_noise_of_its_own(frames):
+    found = noise_of_frames(frames[1:], still(COUNT - 1), frames[0], is_mean=False)
+    assert found.deviation == pytest.approx(NOISE, rel=0.1)
+
+
 def test_texture_that_lasts_shows_in_beginning_and_end_only():
     rng, scene, state, frames = np.random.default_rng(1), SCENES["camera"](*SHAPE), None, []
     for _ in range(COUNT):
@@ -66,3 +71,51 @@ def test_texture_that_lasts_shows_in_beginning_and_end_only():
     clip = halve(np.array(frames), still(), SHAPE, COUNT)
     new, lasting = clip.alternate.noise(), clip.lasting.noise()
     assert lasting.deviation > 3 * new.deviation
+
+
+def lasting_noise(rho, seed, count=COUNT):
+    """Frames of smooth noise that is alike from frame to frame, about a scene, and the noise of their mean."""
+    rng, scene, state, frames = np.random.default_rng(seed), SCENES["camera"](*SHAPE), None, []
+    for _ in range(count):
+        fresh = smooth_noise(rng)
+        state = fresh if state is None else rho * state + np.sqrt(1 - rho**2) * fresh
+        frames.append(scene + state)
+    stack = np.array(frames)
+    return stack, stack.mean(axis=0) - scene
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("rho", [0.0, 0.3, 0.5])
+def test_the_mean_has_the_noise_that_frames_share(rho, seed):
+    frames, left = lasting_noise(rho, seed)
+    clip = halve(frames, still(), SHAPE, COUNT)
+    # Alternate frames tell a third of it where ρ is one half.
+    assert clip.noise.deviation == pytest.approx(left.std(), rel=0.25)
+    assert np.sqrt(clip.frame_noise) == pytest.approx(NOISE, rel=0.2)
+    assert clip.beyond < 0.05 * NOISE**2
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 7])
+def test_few_frames_tell_no_noise_that_they_share(count):
+    frames, _ = lasting_noise(0.0, 0, count)
+    clip = halve(frames, still(count), SHAPE, count)
+    np.testing.assert_array_equal(clip.noise.power, clip.alternate.noise().power)
+
+
+def test_texture_that_lives_for_several_frames_is_beyond_noise():
+    frames, _ = lasting_noise(0.9, 1)
+    clip = halve(frames, still(), SHAPE, COUNT)
+    assert clip.beyond > 0.1 * NOISE**2
+    assert clip.noise.deviation > 2 * clip.alternate.noise().deviation
+
+
+def test_what_registration_leaves_for_long_is_no_noise_of_the_mean():
+    rng, scene = np.random.default_rng(3), cv2.GaussianBlur(SCENES["camera"](*SHAPE), (0, 0), 1.0)
+    drift = np.float32(np.linspace(-1, 1, COUNT))
+    slope = (np.roll(scene, -1, axis=1) - np.roll(scene, 1, axis=1)) / 2
+    places = cv2.GaussianBlur(rng.standard_normal(SHAPE).astype(np.float32), (0, 0), 12)
+    clean = [smooth_noise(rng) / 5 for _ in range(COUNT)]
+    frames = np.stack([scene + by * slope * places / places.std() + one for by, one in zip(drift, clean, strict=True)])
+    clip = halve(frames, still(), SHAPE, COUNT)
+    assert clip.lasting.noise().deviation > 1.5 * np.mean(clean, axis=0).std()
+    assert clip.noise.deviation == pytest.approx(np.mean(clean, axis=0).std(), rel=0.15)

@@ -7,7 +7,7 @@ b : one of four bands of detail, differences of Gaussians of 0, 1, 2, 4 and 8 pi
 r : correlation of b of A with b of B in a window, the smaller one of both ways to halve the clip; ρ = 2 r / (1 + r)
     that of their mean with the scene (Spearman and Brown), as far as the frames tell
 g : share of the mean in a band of the result
-n² : variance of the noise of the mean in a small window
+n² : variance of the noise of the mean in a small window; that of photons depends on the level
 
 What belongs to the scene is in both halves.  Noise is not, nor are waves, clouds, rain and what registration has torn;
 deconvolution sharpens them all the same, and so do weights that follow sharpness.  Where ρ is low and the result has
@@ -19,7 +19,8 @@ scene is still in the lower ones.
 Near an edge the windows of the bands hold the edge, on which the halves agree, and a ring behind it is not noticed.
 Flat parts are therefore looked at once more in small windows with sharp borders: where the mean varies by no more than
 its noise in a window that ends before the edge, the scene is flat to within the noise, and what the result varies by
-beyond the mean is rings or noise.  There all of the image is the mean's.
+beyond the mean is rings or noise.  There all of the image is the mean's, even if the halves agree: deblurred alike,
+they have the same rings.
 
 What is left of the colours below the bands is that of the mean where it differs by more than two grey levels: weights
 may have preferred a frame that is tinted.
@@ -36,6 +37,7 @@ import numpy as np
 
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
+from ..core.noise import NoiseCurve
 from ..core.noise_spectrum import SIDE, NoiseSpectrum
 from ..registration.registered_noise import Halves
 
@@ -53,7 +55,7 @@ _LEAST_TINT, _TINT = 1 / 255, 2 / 255
 # Rows that are worked on at once, and those around that count: the Gaussians of all bands and of the widest window.
 _ROWS, _AROUND = 256, 128
 # Bytes a pixel, and a pixel and channel, of these rows.
-_BYTES, _CHANNEL_BYTES = 70, 50
+_BYTES, _CHANNEL_BYTES = 74, 50
 # Least g, and the share of the image that has it, that is worth a remark.
 _CLEAR, _REMARKED = 0.5, 0.15
 
@@ -73,17 +75,20 @@ def keep_agreed(
     noise: NoiseSpectrum,
     halvings: Sequence[Halves],
     full_scale: tuple[float, float] = (0.0, 1.0),
+    photons: NoiseCurve | None = None,
 ) -> Guarded:
     """Let the mean of the registered frames take the place of detail that they do not agree on.
 
     ``result`` and ``mean`` (H, W) or (H, W, 3); ``noise`` is that of the mean; the halves of ``halvings``, (H, W) each,
-    are as sharp as the result; ``full_scale`` are black and white.
+    are as sharp as the result; ``full_scale`` are black and white; ``photons`` is the noise at every level, relative to
+    its average.
     """
     image, (share, flat) = np.empty_like(result), np.empty((2, *result.shape[:2]), np.float32)
-    least = _variance_within(noise)
+    usual = _variance_within(noise)
     for top in range(0, len(result), _ROWS):
         first, above = max(top - _AROUND, 0), min(top, _AROUND)
         rows, own = slice(first, top + _ROWS + _AROUND), slice(above, above + _ROWS)
+        least = _at_levels(usual, mean[rows], photons)
         parts = _agreed(result[rows], mean[rows], least, [Halves(h.first[rows], h.second[rows]) for h in halvings])
         for whole, part in zip((image, share, flat), parts, strict=True):
             whole[top : top + _ROWS] = part[own]
@@ -105,7 +110,7 @@ def keep_agreed_memory(shape: tuple[int, ...]) -> float:
 
 
 def _agreed(
-    result: FloatArray, mean: FloatArray, least: float, halvings: Sequence[Halves]
+    result: FloatArray, mean: FloatArray, least: FloatArray, halvings: Sequence[Halves]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return some rows of the guarded image, the largest g of bands and tint, and g of flat parts."""
     left, all_of_mean, flat = result, mean, _flat_parts(mean, result, least)
@@ -133,7 +138,14 @@ def _agreed(
     return image, share, flat
 
 
-def _flat_parts(mean: FloatArray, result: FloatArray, least: float) -> FloatArray:
+def _at_levels(variance: float, mean: FloatArray, photons: NoiseCurve | None) -> FloatArray:
+    """Variance of noise, (H, W), at the level that a mean (H, W[, 3]) has in small windows; the same for all levels."""
+    if photons is None:
+        return np.full(mean.shape[:2], variance, np.float32)
+    return np.float32(variance) * photons.variance(cv2.blur(luminance(mean), (_FLAT, _FLAT)))
+
+
+def _flat_parts(mean: FloatArray, result: FloatArray, least: FloatArray) -> FloatArray:
     """Return g of flat parts: of each pixel the largest g of the small windows that hold it, with a soft edge.
 
     A window is flat up to a variance of ``least``, which that of pure noise exceeds in about half of the windows, and
@@ -144,7 +156,7 @@ def _flat_parts(mean: FloatArray, result: FloatArray, least: float) -> FloatArra
     def variance(image: FloatArray) -> FloatArray:
         return np.asarray(cv2.blur(image * image, side) - np.square(cv2.blur(image, side)), np.float32)
 
-    flat = np.clip(2 - variance(luminance(mean)) / np.float32(least + _NOTHING), 0, 1)
+    flat = np.clip(2 - variance(luminance(mean)) / (least + np.float32(_NOTHING)), 0, 1)
     given = flat * _excess(variance(result), variance(mean))
     return np.asarray(cv2.blur(cv2.dilate(given, np.ones(side, np.uint8)), (3, 3)), np.float32)
 

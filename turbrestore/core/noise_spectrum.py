@@ -60,8 +60,12 @@ class NoiseSpectrum:
         return NoiseSpectrum(np.maximum(self.power - 2 * self.error, _LEAST), self.error, self.relative)
 
     def scaled(self, factor: float) -> NoiseSpectrum:
-        """Return the spectrum of the same noise with its variance multiplied."""
-        return NoiseSpectrum(self.power * factor, self.error * factor, self.relative * factor)
+        """Return the spectrum of the same noise with its variance multiplied; e is a ratio, and stays."""
+        return self.times(np.full_like(self.power, factor))
+
+    def times(self, factors: Float64Array) -> NoiseSpectrum:
+        """Return the spectrum with the variance of every ring multiplied by a factor of its own (rings,)."""
+        return NoiseSpectrum(self.power * factors, self.error * factors, self.relative)
 
     @property
     def deviation(self) -> float:

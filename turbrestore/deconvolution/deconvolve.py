@@ -129,7 +129,9 @@ class Deconvolution:
     fidelity : float
         λ that was used.
     noise : float
-        Standard deviation of the noise of the blurred image, estimated, intensity.
+        Noise that the deconvolution reckons with, intensity: the standard deviation of white noise that is as strong as
+        that of the blurred image at the frequency of which the blur leaves half, and no less than second differences
+        tell.  The deviation of a pixel is smaller where the noise is smooth.
     iterations : int
         Iterations that were run.
     converged : bool
@@ -170,7 +172,7 @@ class Deconvolution:
     def _repr_html_(self) -> str:
         facts = [
             ("blur removed", f"{self.sigma:.2f} pixels" if self.sigma > 0 else "none"),
-            ("noise before", f"{100 * self.noise:.2f} % of full scale"),
+            ("noise at half frequency", f"{100 * self.noise:.2f} % of full scale, if it were white"),
             ("iterations", f"{self.iterations}, {'' if self.converged else 'not '}converged"),
         ]
         return preview("Deblurred image", facts, self.image)

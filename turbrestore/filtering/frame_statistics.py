@@ -12,7 +12,7 @@ for a median, which moving objects do not change.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -51,6 +51,8 @@ _RESERVOIR, _ROWS, _MEDIAN_DEVIATION, _HEAVY_TAIL = 25, 64, 1.4826, 4.0
 _SOBEL_NOISE, _SOBEL_AREA = 12 / 64, 3.0
 # κ of pure noise, and the least share of noise for which a window without its middle is better.
 _MIDDLE, _LEAST_SHARE = 0.25, 0.15
+# Rings of the highest frequencies, chosen: where scenes have little, and noise is told best.
+_HIGHEST = 4
 # Largest β, the variance of noise that is worth one unit of squared gradient, and steps of the search for β.
 _LARGEST_WEIGHT, _PRICE, _BISECTIONS = 2.0, 10.0, 12
 
@@ -99,7 +101,7 @@ def measure_frame_statistics(
     sensor_noise = fit_noise_curve(mean, np.where(covered, variance, fine), energy).variance(mean)
     mean_frame, deviation, moments = _without_outliers(frames, flows, mean, variance, template, window, threads)
     noise = noise_of_frames(frames, flows, mean_frame)
-    coloured = _coloured(template, noise.certain)
+    coloured = _coloured(template, noise)
     sharpness, spread, explained, left_out = _leave_middle_out(moments, coloured, sensor_noise, window)
     scale = _score_scale(sharpness, spread, explained)
     weight = _sharpness_weight(sharpness, spread - explained, scale**2 * spread, float(sensor_noise.mean()) / count)
@@ -237,9 +239,14 @@ def _deviation(variance: np.ndarray, window: float = OUTLIER_WINDOW) -> FloatArr
 
 
 def _coloured(template: FloatArray, noise: NoiseSpectrum) -> FloatArray:
-    """Template on which white noise projects as noise of a spectrum and of the same variance does on ``template``."""
+    """Template on which white noise projects as noise of a spectrum and of the same variance does on ``template``.
+
+    Rings in which no noise is certain have what the highest ones have: white noise is usually among it.
+    """
+    known = noise.certain
+    known = replace(known, power=np.maximum(known.power, np.median(known.power[-_HIGHEST:])))
     frequency = np.hypot(np.fft.fftfreq(template.shape[1])[:, None], np.fft.rfftfreq(template.shape[2]))
-    response = np.sqrt(noise.at(frequency)) / noise.deviation
+    response = np.sqrt(known.at(frequency)) / known.deviation
     spectrum = rfft2(template) * response.astype(np.float32)
     return np.asarray(irfft2(spectrum, template.shape[1:]), np.float32)
 

@@ -11,8 +11,9 @@ detail of m belongs to the sensor where it is far stronger than the noise of m, 
 frames, and where it does not add to v, as detail that moves would, by s² times its squared slope.  The survey has m
 and v, so clips without a pattern are told at no cost.
 
-P is white, and the scene fades towards high frequencies.  Wiener's filter therefore finds P in the mean of the frames
-of a segment: at each frequency, P has the power of the highest frequencies, and the scene has the rest.
+P is white, and the scene fades towards high frequencies.  Wiener's filter therefore finds P in the mean of the k frames
+of a segment: at each frequency, P has the power of the highest frequencies, less n² / k, which is noise, and the scene
+and the noise have the rest.  Of one frame, P can hardly be told from its noise, and hardly any of it is subtracted.
 """
 
 from __future__ import annotations
@@ -76,7 +77,9 @@ def without_pixel_pattern(survey: Survey, moments: Moments) -> tuple[Survey, tup
     if motion is None:
         return survey, ()
     starts = _segment_starts(survey, moments)
-    offsets = np.stack([_white_part(mean) for mean in _means_of_segments(survey, starts)])
+    means, counts = _means_of_segments(survey, starts)
+    noise = float(np.median(moments.change))
+    offsets = np.stack([_white_part(mean, noise / count) for mean, count in zip(means, counts, strict=True)])
     # Where nothing moves, nobody can tell the offsets from the scene.
     offsets *= motion if offsets.ndim == 3 else motion[..., None]
     pattern = PixelPattern(starts, offsets, survey.clip.window)
@@ -149,23 +152,26 @@ def _fine_detail(frame: FloatArray, places: NDArray[np.int64]) -> FloatArray:
     return (grey - cv2.GaussianBlur(grey, (0, 0), 1.0)).ravel()[places]
 
 
-def _means_of_segments(survey: Survey, starts: tuple[int, ...]) -> FloatArray:
-    """Means of the whole frames of each segment, (K, H, W) or (K, H, W, 3)."""
+def _means_of_segments(survey: Survey, starts: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
+    """Means of the whole frames of each segment, (K, H, W) or (K, H, W, 3), and their numbers of frames, (K,)."""
     totals, counts = np.zeros((len(starts), *survey.clip.shape[1:]), np.float32), np.zeros(len(starts), np.float32)
     for number, frame in zip(survey.numbers, survey, strict=True):
         cv2.accumulate(frame, totals[_segment(starts, number)])
         counts[_segment(starts, number)] += 1
-    return (totals.T / counts).T
+    return (totals.T / counts).T, counts
 
 
 def _segment(starts: tuple[int, ...], number: int) -> int:
     return max(bisect_right(starts, number) - 1, 0)
 
 
-def _white_part(image: FloatArray) -> FloatArray:
-    """Filter a mean (H, W) or (H, W, 3) by Wiener's filter for white noise of the power of the highest frequencies."""
+def _white_part(image: FloatArray, noise: float = 0.0) -> FloatArray:
+    """Filter a mean (H, W) or (H, W, 3) by Wiener's filter for white offsets of the power of the highest frequencies.
+
+    ``noise`` is the part of that power which is noise of the mean.
+    """
     if image.ndim == 3:
-        return np.stack([_white_part(image[..., channel]) for channel in range(3)], axis=-1)
+        return np.stack([_white_part(image[..., channel], noise) for channel in range(3)], axis=-1)
     # The cosine transform continues an image by its reflection, and keeps white noise white.
     import scipy.fft
 
@@ -178,6 +184,7 @@ def _white_part(image: FloatArray) -> FloatArray:
     rings = (frequency * min(height, width) / 4).astype(np.int64)
     power = np.bincount(rings.ravel(), np.square(spectrum).ravel()) / np.maximum(np.bincount(rings.ravel()), 1)
     share = np.divide(white, power, out=np.ones_like(power), where=power > white).astype(np.float32)
+    share *= np.float32(max(1 - noise / max(white, 1e-18), 0.0))
     offsets = scipy.fft.idctn(spectrum * share[rings], norm="ortho")
     return np.asarray(offsets * _usual(offsets), np.float32)
 

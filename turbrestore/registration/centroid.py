@@ -208,7 +208,7 @@ def centroid_steps(
         draft = fused and not last and (not sizes or (far and len(sizes) % 2 == 0))
         starts = repeat(None) if draft or not sizes else iter_frames(flows)
         # Only frames that are registered tell smooth noise from detail.
-        noise = noise_of_frames(stack, flows, image).deviation if sizes else 0.0
+        noise = noise_of_frames(stack, flows, image, fused).deviation if sizes else 0.0
         reference = prepare_reference(image, flow_params, runtime, noise)
         solved = measure_flows(reference, prepared or iter_frames(stack), starts, draft)
         if draft and sizes:

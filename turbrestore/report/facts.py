@@ -26,8 +26,10 @@ _STAGE_NAMES = {
     "seeing": "Seeing",
     "identify": "Flow model",
     "filter": "Alternating filter",
+    "noise": "Noise of the halves",
     "witnesses": "Witnesses of the blur",
     "deconvolve": "Deconvolution",
+    "agreement": "Agreement of the halves",
     "uncertainty": "Uncertainty",
 }
 
@@ -171,7 +173,8 @@ def _blur_facts(restoration: Restoration) -> Iterator[Fact]:
         note = f"{found.limit:.2f} cycles per pixel: beyond, noise is stronger than the scene"
         yield Fact("Finest detail", f"{1 / found.limit:.1f} px a period", note)
     if done is not None:
-        yield Fact("Noise before deblurring", f"{100 * done.noise:.2f} %", "of full scale")
+        note = "of full scale: white noise as strong as that where the blur leaves half of the detail"
+        yield Fact("Noise that deblurring meets", f"{100 * done.noise:.2f} %", note)
         if done.sigma > 0:
             note = "converged" if done.converged else "not converged: allow more iterations"
             value = (

@@ -1,0 +1,153 @@
+"""The blur to remove, learnt from simulated clips whose scene is known.
+
+Symbols
+-------
+x : what the witnesses say, standardised: widths by every witness and by their posterior, s and s_4, the spectrum of the
+    image, that of its noise, the ratio to that of the mean of the frames, and costs of the image
+σ, p : width and exponent of the transfer function of the image; see :func:`turbrestore.blur.psf.blur_otf`
+G : gain, decibels, by which the visible error ``e² + e_0²`` falls where a blur (σ, p) is removed; e² is the mean
+    squared error, and e_0² that of 38 dB, below which no error is seen
+
+A few small networks, trained alike from different starts, map x to ln σ with its deviation, to p and to G on a grid of
+widths for two exponents.  Their mean counts, and their scatter adds to the deviation.  What is removed is the width of
+the largest G at the exponent p, and nothing where no G is above zero: a width that is right for the transfer function
+may be too wide for the noise, and a doubtful one costs more where it is too wide than where it is too narrow.  That is
+learnt with the rest, so there is no threshold.
+
+``python benchmarks/blur_training.py`` makes the clips, trains and judges the networks, and writes ``learnt_blur.npz``.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.arrays import FloatArray
+from ..core.noise_spectrum import NoiseSpectrum
+from .psf import Float64Array
+from .witnesses.image_evidence import ImageEvidence
+from .witnesses.spectral_variation import RINGS, SIDE, SpectralVariation, window_power
+
+# Grid of G: widths, pixels, the first of which is no blur, and exponents.
+WIDTHS: Float64Array = np.array([0, 0.35, 0.5, 0.7, 0.95, 1.25, 1.65, 2.2, 2.9, 3.9, 5.4, 7.5])
+EXPONENTS = (1.3, 2.0)
+# Rings whose values are read, and widths at which costs of the image are read, pixels.
+_PICKED = np.array([1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20, 24, 28])
+_COSTS: Float64Array = np.geomspace(0.3, 9, 14)
+# Costs of a gradient above this are all the same, and so many gradients make a unit.
+_DEAREST, _GRADIENTS = 20.0, 40.0
+# Standardised values beyond this were hardly seen in training.
+FARTHEST = 4.0
+# Mean of the squared window of SIDE pixels along both axes.
+_PROFILE = 9 / 64
+
+
+@dataclass(frozen=True, eq=False)
+class LearntBlur:
+    """What the networks say about the blur of an image."""
+
+    width: Float64Array  # (3,): 16 %, 50 % and 84 % quantiles of the width, pixels
+    exponent: float
+    removed: float  # width of the largest gain, pixels
+    gain: float  # decibels of visible error
+
+
+def blur_features(
+    image: FloatArray,
+    widths: NDArray[np.floating],
+    variation: SpectralVariation | None,
+    evidence: ImageEvidence,
+    noise: NoiseSpectrum,
+    facts: tuple[float, float, float, float],
+) -> Float64Array:
+    """Return what the networks read, NaN where it is not known.
+
+    ``image`` (H, W); ``widths`` are the quantiles by the witnesses and by their posterior, pixels; ``noise`` is that of
+    the image; ``facts`` are the probability of air, the exponent of the posterior, the variance of the displacement and
+    the number of independent frames.
+    """
+    air, exponent, displacement, frames = facts
+    unknown = np.full(len(_PICKED), np.nan)
+    of_noise = noise.at(RINGS) * _PROFILE * SIDE**2
+    power = _spectrum(image)
+    rows = [
+        _log(np.ravel(widths), 0.05),
+        [air, exponent, *_log([displacement], 1e-3), *_log([frames], 1.0)],
+        _log(power / power[1:4].mean(), 1e-8)[_PICKED],
+        np.clip(_log(power / of_noise, 1e-2), -1, 9)[_PICKED],
+        _log([noise.deviation], 1e-5),
+        _log([float(image.std())], 1e-4),
+        _log([of_noise[4] / of_noise[20]], 1e-3),
+    ]
+    if variation is None:
+        rows += [[np.nan, np.nan], unknown, unknown, unknown, unknown]
+    else:
+        rows += [
+            [np.log(variation.reduction), *_log([variation.stretch], 1e-3)],
+            _log(variation.amplitude, 1e-4)[_PICKED],
+            _log(variation.power, 1e-4)[_PICKED],
+            np.clip(_log(variation.signal, 1e-2), -3, 9)[_PICKED],
+            _log(variation.with_power(image), 0.05)[_PICKED],
+        ]
+    costs, estimate = evidence.costs - evidence.costs.min(), evidence.estimate
+    for curve in costs:
+        read = _GRADIENTS * np.interp(np.log(_COSTS), np.log(evidence.widths), curve)
+        rows += [[np.log(evidence.widths[curve.argmin()]), min(_GRADIENTS * curve.min(), _DEAREST)]]
+        rows += [np.minimum(read, _DEAREST)]
+    rows += [_log([estimate.sigma], 0.05), [np.log(estimate.reduction)], _log([estimate.noise], 1e-5)]
+    return np.concatenate([np.asarray(row, np.float64) for row in rows])
+
+
+def learnt_blur(features: Float64Array, weights: Mapping[str, NDArray[np.floating]] | None = None) -> LearntBlur:
+    """Evaluate the networks; ``weights`` are those of the package unless others are given."""
+    weights = _weights() if weights is None else weights
+    # What is not known is taken for usual.
+    x = np.clip(np.nan_to_num((features - weights["middle"]) / weights["scale"]), -FARTHEST, FARTHEST)
+    x = np.broadcast_to(x, (len(weights["w1"]), len(x)))
+    for layer in "12":
+        x = np.einsum("nij,nj->ni", weights[f"w{layer}"], x) + weights[f"b{layer}"]
+        x = x / (1 + np.exp(-x))
+    out = np.einsum("nij,nj->ni", weights["w3"], x) + weights["b3"]
+    spread = float(np.sqrt(np.mean(np.exp(2 * out[:, 1])) + out[:, 0].var()))
+    middle = float(out[:, 0].mean())
+    exponent = float(np.clip(out[:, 2].mean(), *EXPONENTS))
+    share = (exponent - EXPONENTS[0]) / (EXPONENTS[1] - EXPONENTS[0])
+    gains = out[:, 3:].mean(axis=0).reshape(len(EXPONENTS), -1)
+    removed, gain = _largest((1 - share) * gains[0] + share * gains[1])
+    return LearntBlur(np.exp(middle + spread * np.array([-1.0, 0.0, 1.0])), exponent, removed, gain)
+
+
+def _largest(gains: Float64Array) -> tuple[float, float]:
+    """Width of the largest gain, by a parabola through the three largest neighbours, and the gain."""
+    at = int(gains.argmax())
+    if at == 0 or gains[at] <= gains[0]:
+        return 0.0, 0.0
+    logs, step = np.log(WIDTHS[1:]), 0.0
+    if 1 < at < len(WIDTHS) - 1:
+        before, here, after = gains[at - 1 : at + 2]
+        step = 0.5 * (before - after) / min(before - 2 * here + after, -1e-9)
+    place = at - 1 + float(np.clip(step, -0.5, 0.5))
+    return float(np.exp(np.interp(place, np.arange(len(logs)), logs))), float(gains[at] - gains[0])
+
+
+def _spectrum(image: FloatArray) -> Float64Array:
+    """Power spectrum of an image by ring; NaN if it is too small for a window."""
+    return window_power(image) if min(image.shape) >= SIDE * 3 // 2 else np.full(len(RINGS), np.nan)
+
+
+def _log(values: object, least: float) -> Float64Array:
+    """Logarithm of values of at least ``least``; NaN stays."""
+    return np.log(np.maximum(np.asarray(values, np.float64), least))
+
+
+@functools.cache
+def _weights() -> dict[str, Float64Array]:
+    """Layers of the networks (n, outputs, inputs), and middle and scale of the features."""
+    path = files("turbrestore.blur").joinpath("learnt_blur.npz")
+    with path.open("rb") as stream, np.load(stream) as held:
+        return {name: held[name].astype(np.float64) for name in held.files}
