@@ -5,6 +5,7 @@
 ``lens``      one Gaussian, disc or square for the whole clip, moved by smooth flows or not at all
 ``mixed``     Gaussians whose width changes from place to place and from frame to frame
 ``near``      the latter with blur of 3 to 8 pixels and long displacements, as of air that is close to the camera
+``close``     kernels of 2 to 6 pixels and long displacements, more alike from place to place; not among random draws
 ``none``      sharp or soft scenes that smooth flows move or that stand still
 
 Scenes are those that no other benchmark shows: dead leaves (Lee, Mumford and Huang 2001), random text and bars, and
@@ -31,7 +32,7 @@ from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
 
 PHOTOGRAPHS = ("gravel", "hubble_deep_field", "immunohistochemistry", "colorwheel", "china", "flower")
 # Simulators and their shares of the clips.
-SHARES = {"screens": 0.3, "kernels": 0.2, "lens": 0.15, "mixed": 0.15, "near": 0.08, "none": 0.12}
+SHARES = {"screens": 0.3, "kernels": 0.2, "lens": 0.15, "mixed": 0.15, "near": 0.08, "none": 0.12, "close": 0.0}
 # Pixels around a clip from which displacement brings in what the frame does not show at rest.
 MARGIN = 32
 # Widths of the stack of blurred scenes that ``mixed`` interpolates.
@@ -48,16 +49,17 @@ class SimulatedClip:
     truth: FloatArray
 
 
-def simulate(seed: int) -> SimulatedClip:
-    """Draw everything about a clip from a seed."""
+def simulate(seed: int, simulator: str | None = None, smooth: bool = False) -> SimulatedClip:
+    """Draw everything about a clip from a seed, unless the simulator is given or strong smooth noise is asked for."""
     rng = np.random.default_rng(seed)
-    simulator = str(rng.choice(list(SHARES), p=list(SHARES.values())))
-    side = int(rng.integers(168, 224)) if simulator == "near" else int(rng.integers(112, 177))
+    drawn = str(rng.choice(list(SHARES), p=list(SHARES.values())))
+    simulator = simulator or drawn
+    side = int(rng.integers(168, 224)) if simulator in ("near", "close") else int(rng.integers(112, 177))
     name = str(rng.choice(["leaves", "text", "bars", "photograph"], p=[0.5, 0.15, 0.05, 0.3]))
     scene = draw_scene(name, side + 2 * MARGIN, rng)
     count = int(np.exp(rng.uniform(np.log(6), np.log(60))))
     frames, truth = _SIMULATORS[simulator](scene, count, rng)
-    return SimulatedClip(simulator, name, record(frames, rng), truth)
+    return SimulatedClip(simulator, name, (smoothly_noisy if smooth else record)(frames, rng), truth)
 
 
 def draw_scene(name: str, side: int, rng: np.random.Generator) -> FloatArray:
@@ -153,11 +155,13 @@ def _screens(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[F
     return np.stack([frame.image for frame in made]), warp(scene[MARGIN:-MARGIN, MARGIN:-MARGIN], invert_flow(mean))
 
 
-def _kernels(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    kinds, width = 7, float(np.exp(rng.uniform(np.log(0.4), np.log(3.0))))
+def _kernels(
+    scene: FloatArray, count: int, rng: np.random.Generator, widths: tuple[float, float] = (0.4, 3.0)
+) -> tuple[FloatArray, FloatArray]:
+    kinds, width = 7, float(np.exp(rng.uniform(*np.log(widths))))
     stack = [cv2.filter2D(scene, -1, _speckles(width, rng), borderType=cv2.BORDER_REFLECT_101) for _ in range(kinds)]
     logs = _wandering(count, (*scene.shape, kinds), float(rng.uniform(10, 60)), float(rng.choice([0, 0.5, 0.9])), rng)
-    contrast, flows, frames = float(rng.uniform(0.5, 2.5)), _flows(count, scene.shape, rng), []
+    contrast, flows, frames = float(rng.uniform(0.5, 2.5)), _flows(count, scene.shape, rng, widths[1] > 4), []
     for log in logs:
         weights = np.exp(contrast * log)
         weights /= weights.sum(-1, keepdims=True)
@@ -223,12 +227,24 @@ def _near(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[Floa
     return _mixed(scene, count, rng, (3.0, 8.0))
 
 
+def _close(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    return _kernels(scene, max(count, 10), rng, (2.0, 6.0))
+
+
 def _none(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     flows = _flows(count, scene.shape, rng)
     return _moved(scene, [scene] * count, flows * (rng.uniform() < 0.6))
 
 
-_SIMULATORS = {"screens": _screens, "kernels": _kernels, "lens": _lens, "mixed": _mixed, "near": _near, "none": _none}
+_SIMULATORS = {
+    "screens": _screens,
+    "kernels": _kernels,
+    "lens": _lens,
+    "mixed": _mixed,
+    "near": _near,
+    "close": _close,
+    "none": _none,
+}
 
 
 def _flows(count: int, shape: tuple[int, ...], rng: np.random.Generator, near: bool = False) -> FloatArray:
@@ -282,3 +298,11 @@ def record(frames: FloatArray, rng: np.random.Generator) -> FloatArray:
         pad = [(0, 0), *((0, side - own) for side, own in zip(frames.shape[1:], even, strict=True))]
         frames = np.pad(coded, pad, mode="edge")
     return np.rint(255 * np.clip(frames, 0, 1)).astype(np.float32) / 255
+
+
+def smoothly_noisy(frames: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Frames with smooth noise of 1 to 10 %, as of film grain, a digital zoom or strong reduction of noise."""
+    noise, width = float(np.exp(rng.uniform(np.log(0.01), np.log(0.1)))), float(rng.uniform(0.6, 2.0))
+    grain = np.stack([cv2.GaussianBlur(one, (0, 0), width) for one in rng.standard_normal(frames.shape)])
+    frames = np.clip(frames + noise * grain / grain.std(), 0, 1)
+    return np.rint(255 * frames).astype(np.float32) / 255

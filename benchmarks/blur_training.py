@@ -2,7 +2,12 @@
 
 ``python benchmarks/blur_training.py make FOLDER FIRST LAST`` restores the clips of the seeds FIRST to LAST − 1
 (:mod:`blur_simulators`) up to the point where their blur is looked for, and keeps for each what the estimator then
-knows and the true transfer function.  Clips that are there are kept, so it goes on where it stopped.
+knows, the true transfer function, and the error of the image behind every blur that might be removed.  Clips that are
+there are kept, so it goes on where it stopped.
+
+``python benchmarks/blur_training.py train FOLDER [--write benchmarks/results/blur_training.md]`` trains the networks of
+:mod:`turbrestore.blur.learnt` and writes their weights.  The table is of networks that were trained without the
+simulator on which they are judged.
 """
 
 from __future__ import annotations
@@ -11,22 +16,39 @@ import argparse
 import pickle
 import sys
 import time
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
-from blur_calibration import registered, transfer_function
-from blur_simulators import SimulatedClip, simulate
+import torch
+from blur_calibration import CORE, registered
+from blur_simulators import SHARES, SimulatedClip, simulate
+from provenance import publish
 
-from turbrestore import TurbrestoreError, evidence, pipeline
+from turbrestore import DeconvolutionParams, TurbrestoreError, pipeline
 from turbrestore.blind import remove_blur
-from turbrestore.blur.posterior import measure_witnesses
-from turbrestore.blur.witnesses.hypotheses import shapes
+from turbrestore.blur import posterior
+from turbrestore.blur.learnt import EXPONENTS, FACTORS, FARTHEST, LearntBlur, blur_features, learnt_blur
+from turbrestore.blur.psf import radial_otf
+from turbrestore.blur.witnesses.spectral_variation import RINGS, SIDE
 from turbrestore.core.arrays import FloatArray
+from turbrestore.core.noise_spectrum import NoiseSpectrum
+from turbrestore.deconvolution.deconvolve import deconvolve
 from turbrestore.runtime.runtime import Runtime
 
-# Distances, pixels, over which differences of the displacement are kept.
-DISTANCES = (2, 4, 8, 16, 32, 64)
+WEIGHTS = Path(__file__).resolve().parent.parent / "turbrestore" / "blur" / "learnt_blur.npz"
+# Mean squared error that is invisible, decibels below which a loss is as bad as any other, and unit of the networks.
+INVISIBLE, WORST, UNIT = 10**-3.8, -8.0, 3.0
+# Widths that are removed, pixels.
+WIDTHS = np.array([0, 0.35, 0.5, 0.7, 0.95, 1.25, 1.65, 2.2, 2.9, 3.9, 5.4, 7.5])
+# Iterations that tell which blur is best; and a loss after which wider blurs are not tried, as a ratio of errors.
+ITERATIONS, HOPELESS = 8, 4.0
+# Place of the width of the posterior among the features.
+USUAL = 10
+# Networks, their inner width, epochs, size of a batch, rate, decay of the weights, and share of units that are dropped.
+NETWORKS, INNER, EPOCHS, BATCH, RATE, DECAY, DROPPED = 10, 48, 60, 64, 3e-3, 0.3, 0.3
 
 
 class _ReachedError(Exception):
@@ -34,58 +56,59 @@ class _ReachedError(Exception):
 
 
 def main() -> int:
-    """Make clips, or train and judge an estimator."""
+    """Make clips, or train and judge networks."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("make",))
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("first", type=int)
-    parser.add_argument("last", type=int)
+    kinds = parser.add_subparsers(dest="what", required=True)
+    make, train = kinds.add_parser("make"), kinds.add_parser("train")
+    for kind in (make, train):
+        kind.add_argument("folder", type=Path)
+    make.add_argument("first", type=int)
+    make.add_argument("last", type=int)
+    make.add_argument("--simulator", choices=SHARES)
+    make.add_argument("--smooth", action="store_true", help="strong smooth noise")
+    train.add_argument("--write", type=Path)
     given = parser.parse_args()
-    given.folder.mkdir(exist_ok=True)
-    for seed in range(given.first, given.last):
-        path = given.folder / f"{seed}.pkl"
-        if not path.exists():
-            begun = time.perf_counter()
-            clip = simulate(seed)
-            found = witnesses_of(clip)
-            path.write_bytes(pickle.dumps({"seed": seed, "simulator": clip.simulator, "scene": clip.scene, **found}))
-            seconds = time.perf_counter() - begun
-            print(seed, clip.simulator, clip.scene, clip.frames.shape, f"{seconds:.1f} s", flush=True)
+    if given.what == "make":
+        given.folder.mkdir(exist_ok=True)
+        make_clips(given.folder, given.first, given.last, given.simulator, given.smooth)
+        return 0
+    clips = read_clips(given.folder)
+    publish(table_of(clips), given.write)
+    every = train_networks(clips, np.ones(len(clips.simulators), bool))
+    np.savez_compressed(WEIGHTS, **{name: values.astype(np.float16) for name, values in every.items()})
     return 0
 
 
-def witnesses_of(clip: SimulatedClip) -> dict[str, object]:
-    """Restore a clip up to its blur: what is known there, and the transfer function that is to be found."""
-    known: dict[str, object] = {"frames": len(clip.frames)}
+def make_clips(folder: Path, first: int, last: int, simulator: str | None, smooth: bool) -> None:
+    """Simulate clips, and keep what is known of each in a file of the folder."""
+    for seed in range(first, last):
+        path = folder / f"{seed}.pkl"
+        if not path.exists():
+            begun = time.perf_counter()
+            clip = simulate(seed, simulator, smooth)
+            found = known_of(clip)
+            path.write_bytes(pickle.dumps({"seed": seed, "simulator": clip.simulator, "scene": clip.scene, **found}))
+            seconds = time.perf_counter() - begun
+            print(seed, clip.simulator, clip.scene, clip.frames.shape, f"{seconds:.1f} s", flush=True)
+
+
+def known_of(clip: SimulatedClip) -> dict[str, object]:
+    """Restore a clip up to its blur: what is known there, the transfer function, and errors behind every blur."""
+    known: dict[str, object] = {}
 
     def spy_levels(*given: object) -> object:
         prepared = prepare(*given)
         known["levels"] = prepared.levels
         return prepared
 
-    def spy_frames(frames: FloatArray, flows: FloatArray, mean: FloatArray, before: object) -> object:
-        known["structure"] = structure_of(flows)
-        known["mean"] = mean.astype(np.float16)
-        known["unregistered"] = frames.mean(axis=0).astype(np.float16)
-        return measure_witnesses(frames, flows, mean, before)
-
-    def spy_image(image: FloatArray, *given: object) -> object:
-        with patch.object(remove_blur, "image_evidence", spy_costs):
-            known["posterior"] = find_blur(image, *given)[1]
-        known["witnesses"], known["image"] = given[-1], image
+    def spy_features(*given: object) -> object:
+        known["features"] = blur_features(*given)
+        known["image"], known["noise"] = given[0], given[4]
         raise _ReachedError
 
-    def spy_costs(*given: object) -> object:
-        known["evidence"] = image_evidence(*given)
-        return known["evidence"]
-
-    prepare, find_blur, image_evidence = pipeline.prepare, remove_blur.find_blur, remove_blur.image_evidence
+    prepare = pipeline.prepare
     try:
-        with (
-            patch.object(pipeline, "prepare", spy_levels),
-            patch.object(evidence, "measure_witnesses", spy_frames),
-            patch.object(remove_blur, "find_blur", spy_image),
-        ):
+        with patch.object(pipeline, "prepare", spy_levels), patch.object(posterior, "blur_features", spy_features):
             pipeline.restore(clip.frames, runtime=Runtime(threads=1))
     except _ReachedError:
         pass
@@ -93,23 +116,204 @@ def witnesses_of(clip: SimulatedClip) -> dict[str, object]:
         return {"refused": str(error)}
     if "image" not in known:
         return {"refused": "no blur is looked for"}
-    image = known["image"]
-    truth = registered(known["levels"].stretched(clip.truth), image)
-    transfer = transfer_function(image, truth)
-    (width,), (exponent,) = shapes(transfer[None])
-    kept = {"image": image.astype(np.float16), "truth": truth.astype(np.float16)}
-    return {**known, **kept, "transfer": transfer, "width": float(width), "exponent": float(exponent)}
+    image = known.pop("image")
+    truth = registered(known.pop("levels").stretched(clip.truth), image)
+    (width, exponent), errors = fitted_blur(image, truth), errors_of(image, truth, known["noise"])
+    return {"features": known["features"], "width": width, "exponent": exponent, "errors": errors}
 
 
-def structure_of(flows: FloatArray) -> FloatArray:
-    """Mean square of the difference of the displacement, less its mean, over some distances; (distances, 2)."""
-    wandering = flows - flows.mean(axis=0)
-    values = np.full((len(DISTANCES), 2), np.nan)
-    for row, distance in enumerate(DISTANCES):
-        if 2 * distance < min(flows.shape[1:3]):
-            apart = wandering[:, :, distance::4] - wandering[:, :, :-distance:4]
-            values[row] = np.square(apart).mean(axis=(0, 1, 2))
-    return values
+def errors_of(image: FloatArray, truth: FloatArray, noise: NoiseSpectrum) -> FloatArray:
+    """Mean squared errors (exponents, widths) of the image without every blur of the grid; NaN where hopeless."""
+    errors = np.full((len(EXPONENTS), len(WIDTHS)), np.nan)
+    for row, exponent in zip(errors, EXPONENTS, strict=True):
+        params = DeconvolutionParams(exponent=exponent, iterations=ITERATIONS)
+        for place, width in enumerate(WIDTHS):
+            if width * remove_blur.SIGMAS_A_SIDE > min(image.shape):
+                break
+            result = deconvolve(image, width, params, runtime=Runtime(threads=1), noise=noise).image
+            row[place] = np.mean(np.square(np.clip(result[CORE], 0, 1) - truth[CORE]))
+            if row[place] > max(HOPELESS * np.nanmin(row), INVISIBLE):
+                break
+    return errors
+
+
+def fitted_blur(image: FloatArray, truth: FloatArray) -> tuple[float, float]:
+    """Width and exponent of the transfer function from the truth to an image, by least squares."""
+    profile = np.hanning(SIDE + 2)[1:-1]
+    nu = np.fft.fftfreq(SIDE)
+    ring = np.rint(np.hypot(nu[:, None], nu) * SIDE).astype(int).ravel()
+    crossed = power = np.zeros(len(RINGS))
+    for top in range(12, image.shape[0] - SIDE - 11, SIDE // 4):
+        for left in range(12, image.shape[1] - SIDE - 11, SIDE // 4):
+            parts = [one[top : top + SIDE, left : left + SIDE] for one in (image, truth)]
+            a, b = (np.fft.fft2((part - part.mean()) * np.outer(profile, profile)) for part in parts)
+            crossed = crossed + np.bincount(ring, (a * b.conj()).real.ravel())[: len(RINGS)]
+            power = power + np.bincount(ring, np.square(np.abs(b)).ravel())[: len(RINGS)]
+    best, found = np.inf, (0.0, 2.0)
+    for exponent in (1.0, 1.15, 1.3, 1.45, 1.6, 1.8, 2.0, 2.3):
+        for width in np.geomspace(0.15, 14, 120):
+            otf = radial_otf(RINGS, width, exponent)
+            # Registration leaves a gain of a few per cent open.
+            gain = np.clip((crossed * otf)[1:].sum() / (power * otf * otf)[1:].sum(), 0.93, 1.07)
+            misfit = (np.square(crossed - gain * otf * power) / np.maximum(power, 1e-12))[1:].sum()
+            if misfit < best:
+                best, found = misfit, (float(width), exponent)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingClips:
+    """Features (n, f), width, that of the posterior, and exponent (n), and gains in visible error, dB (n, e, w)."""
+
+    simulators: np.ndarray
+    features: np.ndarray
+    width: np.ndarray
+    usual: np.ndarray
+    exponent: np.ndarray
+    gains: np.ndarray
+
+
+def read_clips(folder: Path) -> TrainingClips:
+    """Read the clips of a folder whose blur was looked for."""
+    held = [pickle.loads(path.read_bytes()) for path in sorted(folder.glob("*.pkl"))]
+    held = [clip for clip in held if "errors" in clip]
+    visible = -10 * np.log10(np.array([clip["errors"] for clip in held]) + INVISIBLE)
+    gains = np.nan_to_num(visible - visible[..., :1], nan=WORST)
+    return TrainingClips(
+        np.array([clip["simulator"] for clip in held]),
+        np.array([clip["features"] for clip in held]),
+        np.maximum([clip["width"] for clip in held], WIDTHS[1]),
+        np.exp([clip["features"][USUAL] for clip in held]),
+        np.array([clip["exponent"] for clip in held]),
+        np.maximum(gains, WORST),
+    )
+
+
+def train_networks(clips: TrainingClips, chosen: np.ndarray) -> dict[str, np.ndarray]:
+    """Train networks on some clips, and return their weights and the scale of the features."""
+    low, middle, high = np.nanquantile(clips.features[chosen], (0.02, 0.5, 0.98), axis=0)
+    scale = np.maximum((high - low) / 4, 1e-3)
+    x = torch.tensor(
+        np.clip(np.nan_to_num((clips.features[chosen] - middle) / scale), -FARTHEST, FARTHEST), dtype=torch.float32
+    )
+    log_width = np.log(clips.width / clips.usual)[chosen, None]
+    grid = [_gains_at(clips.gains[place], clips.usual[place] * FACTORS).ravel() for place in np.flatnonzero(chosen)]
+    targets = [log_width, clips.exponent[chosen, None], np.array(grid) / UNIT]
+    y = torch.tensor(np.concatenate(targets, axis=1), dtype=torch.float32)
+    layers: dict[str, list[np.ndarray]] = {f"{kind}{layer}": [] for layer in (1, 2, 3) for kind in "wb"}
+    for member in range(NETWORKS):
+        network = _train_one(x, y, member)
+        for layer, place in ((1, 0), (2, 3), (3, 6)):
+            layers[f"w{layer}"].append(network[place].weight.detach().numpy())
+            layers[f"b{layer}"].append(network[place].bias.detach().numpy())
+    weights = {"middle": middle, "scale": scale, **{name: np.array(values) for name, values in layers.items()}}
+    for name in ("w3", "b3"):
+        weights[name][:, 3:] *= UNIT
+    return weights
+
+
+def _train_one(x: torch.Tensor, y: torch.Tensor, seed: int) -> torch.nn.Sequential:
+    torch.manual_seed(seed)
+    torch.set_num_threads(1)
+    sizes, inner = (x.shape[1], INNER, INNER), []
+    for before, after in pairwise(sizes):
+        inner += [torch.nn.Linear(before, after), torch.nn.SiLU(), torch.nn.Dropout(DROPPED)]
+    network = torch.nn.Sequential(*inner, torch.nn.Linear(INNER, y.shape[1] + 1))
+    optimiser = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=DECAY)
+    steps = EPOCHS * -(-len(x) // BATCH)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=steps)
+    for _ in range(EPOCHS):
+        for batch in torch.randperm(len(x)).split(BATCH):
+            out = network(x[batch] + 0.05 * torch.randn_like(x[batch]))
+            width, exponent, gains = y[batch, 0], y[batch, 1], y[batch, 2:]
+            log = out[:, 1].clamp(-3, 1)
+            likelihood = (0.5 * torch.square((width - out[:, 0]) / log.exp()) + log).mean()
+            loss = torch.square(out[:, 3:] - gains).mean() + 0.1 * likelihood
+            loss = loss + 0.1 * torch.square(out[:, 2] - exponent).mean()
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+    return network.eval()
+
+
+def table_of(clips: TrainingClips) -> str:
+    """Judge networks on each simulator that they were not trained on, and on a fifth of all clips."""
+    lines = [
+        "# Blur that is learnt",
+        "",
+        "Made by `python benchmarks/blur_training.py train FOLDER --write benchmarks/results/blur_training.md`.",
+        "",
+        "Error of ln width where the blur exceeds .6 px, and share of true widths within the 68 % interval; gain in",
+        "visible error (MSE plus that of 38 dB), dB, by the best blur of the grid, the true one, and what is removed;",
+        "clips that are worse than the filtered image by more than .2 dB.",
+        "",
+        "| left out | clips | error: bias, median, nine of ten | within | best | true | removed | worse |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    rng = np.random.default_rng(0)
+    folds = rng.integers(0, 5, len(clips.simulators))
+    for name in sorted(set(clips.simulators)):
+        held = clips.simulators == name
+        weights = train_networks(clips, ~held)
+        lines.append(
+            _row(
+                name,
+                clips,
+                held,
+                {
+                    place: learnt_blur(clips.features[place], clips.usual[place], weights)
+                    for place in np.flatnonzero(held)
+                },
+            )
+        )
+    found: dict[int, LearntBlur] = {}
+    for fold in range(5):
+        weights = train_networks(clips, folds != fold)
+        found |= {
+            place: learnt_blur(clips.features[place], clips.usual[place], weights)
+            for place in np.flatnonzero(folds == fold)
+        }
+    for name in sorted(set(clips.simulators)):
+        lines.append(_row(f"a fifth, {name}", clips, clips.simulators == name, found))
+    lines.append(_row("a fifth", clips, np.ones(len(folds), bool), found))
+    return "\n".join(lines) + "\n"
+
+
+def _row(title: str, clips: TrainingClips, held: np.ndarray, found: dict[int, LearntBlur]) -> str:
+    places = np.flatnonzero(held)
+    quantiles = np.log([found[place].width for place in places])
+    true, wide = np.log(clips.width[places]), clips.width[places] > 0.6
+    error = (quantiles[:, 1] - true)[wide]
+    within = ((true >= quantiles[:, 0]) & (true <= quantiles[:, 2])).mean()
+    gains = clips.gains[places]
+    removed = np.array(
+        [
+            _gain(gain, found[place].removed, found[place].removed_exponent)
+            for gain, place in zip(gains, places, strict=True)
+        ]
+    )
+    right = [_gain(gain, clips.width[place], clips.exponent[place]) for gain, place in zip(gains, places, strict=True)]
+    size = np.abs(error) if error.size else np.array([np.nan])
+    return (
+        f"| {title} | {len(places)} | {np.median(error) if error.size else np.nan:+.2f}, {np.median(size):.2f}, "
+        f"{np.quantile(size, 0.9):.2f} | {within:.0%} | {gains.max((1, 2)).mean():.2f} | {np.mean(right):.2f} | "
+        f"{removed.mean():.2f} | {(removed < -0.2).mean():.0%} |"
+    )
+
+
+def _gains_at(gains: np.ndarray, widths: np.ndarray) -> np.ndarray:
+    """Gains (exponents, widths) on the grid of WIDTHS at other widths; those of a narrow blur grow as its square."""
+    logs = np.log(np.maximum(widths, WIDTHS[1]))
+    narrow = np.minimum(np.square(widths / WIDTHS[1]), 1)
+    return np.array([narrow * np.interp(logs, np.log(WIDTHS[1:]), row[1:]) for row in gains])
+
+
+def _gain(gains: np.ndarray, width: float, exponent: float) -> float:
+    """Gain by removing one blur, from the gains on the grid (exponents, widths)."""
+    share = np.clip((exponent - EXPONENTS[0]) / (EXPONENTS[1] - EXPONENTS[0]), 0, 1)
+    low, high = _gains_at(gains, np.array([width]))[:, 0]
+    return float((1 - share) * low + share * high)
 
 
 if __name__ == "__main__":

@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..blur.estimation import BlurEstimate, estimate_blur, limit_to_edges
-from ..blur.posterior import BlurPosterior, BlurWitnesses, blur_posterior
+from ..blur.posterior import BlurPosterior, BlurWitnesses, estimate_posterior
 from ..blur.psf import Float64Array
-from ..blur.witnesses.image_evidence import image_evidence
 from ..core.arrays import FloatArray, check_image, luminance
 from ..core.decision import Decision
-from ..core.noise import NoiseCurve
-from ..core.noise_spectrum import NoiseSpectrum
+from ..core.noise import NoiseCurve, estimate_noise
+from ..core.noise_spectrum import NoiseSpectrum, white_noise
 from ..deconvolution.deconvolve import Deconvolution, DeconvolutionParams, deconvolve_steps, whole_image_fidelity
 from ..deconvolution.memory import deconvolution_memory
 from ..deconvolution.problem import read_blur
@@ -92,7 +91,7 @@ def remove_blur_steps(
     params, guards = deconvolution or DeconvolutionParams(), guards or GuardParams()
     if psf is not None:
         params = replace(params, sigma=read_blur(psf)[1])
-    blur, posterior = find_blur(image, params, runtime, witnesses)
+    blur, posterior = find_blur(image, params, runtime, witnesses, noise)
     if posterior is None:
         sigma, params = blur_to_remove(blur, params)
     else:
@@ -194,7 +193,11 @@ def guarded_steps(
 
 
 def find_blur(
-    image: FloatArray, params: DeconvolutionParams, runtime: Runtime, witnesses: BlurWitnesses | None
+    image: FloatArray,
+    params: DeconvolutionParams,
+    runtime: Runtime,
+    witnesses: BlurWitnesses | None,
+    noise: NoiseSpectrum | None = None,
 ) -> tuple[BlurEstimate | None, BlurPosterior | None]:
     """Estimate the blur by the image, and by the frames where there are witnesses."""
     if params.sigma is not None:
@@ -204,13 +207,11 @@ def find_blur(
     grey = luminance(image)
     if witnesses.picture is not None:
         grey = np.ascontiguousarray(grey[witnesses.picture])
-    evidence = image_evidence(grey, runtime)
-    ratio = None if witnesses.variation is None else witnesses.variation.with_power(grey)
-    posterior = blur_posterior(evidence, witnesses, ratio)
+    evidence, posterior = estimate_posterior(grey, witnesses, noise or white_noise(estimate_noise(grey)), runtime)
+    if evidence is None:
+        return estimate_blur(image, exponent=params.exponent, runtime=runtime), posterior
     widest = min(WIDEST, min(grey.shape) / SIGMAS_A_SIDE)
     posterior = replace(posterior, removed=min(posterior.removed, widest))
-    if evidence is None:
-        return estimate_blur(image, exponent=params.exponent, runtime=runtime), replace(posterior, removed=0.0)
     if posterior.removed == 0:
         return evidence.estimate, posterior
     # No scene is steeper behind a blur than a step.

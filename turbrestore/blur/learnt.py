@@ -9,10 +9,10 @@ G : gain, decibels, by which the visible error ``e² + e_0²`` falls where a blu
     squared error, and e_0² that of 38 dB, below which no error is seen
 
 A few small networks, trained alike from different starts, map x to ln σ with its deviation, to p and to G on a grid of
-widths for two exponents.  Their mean counts, and their scatter adds to the deviation.  What is removed is the width of
-the largest G at the exponent p, and nothing where no G is above zero: a width that is right for the transfer function
-may be too wide for the noise, and a doubtful one costs more where it is too wide than where it is too narrow.  That is
-learnt with the rest, so there is no threshold.
+widths for two exponents; widths are relative to that of the posterior, which is about right at every scale.  Their mean
+counts, and their scatter adds to the deviation.  Of the blurs whose G is as good as the largest, but for a difference
+that is not seen, the widest up to σ is removed; none is where all of G is too small to be seen.  So it is no wider than
+the noise allows, and narrower than σ where that is doubtful and too wide a blur would cost more than too narrow a one.
 
 ``python benchmarks/blur_training.py`` makes the clips, trains and judges the networks, and writes ``learnt_blur.npz``.
 """
@@ -33,14 +33,16 @@ from .psf import Float64Array
 from .witnesses.image_evidence import ImageEvidence
 from .witnesses.spectral_variation import RINGS, SIDE, SpectralVariation, window_power
 
-# Grid of G: widths, pixels, the first of which is no blur, and exponents.
-WIDTHS: Float64Array = np.array([0, 0.35, 0.5, 0.7, 0.95, 1.25, 1.65, 2.2, 2.9, 3.9, 5.4, 7.5])
+# Grid of G: widths relative to that of the posterior, the first of which is no blur, and exponents.
+FACTORS: Float64Array = np.array([0, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.35, 1.6, 2.0, 2.6])
 EXPONENTS = (1.3, 2.0)
 # Rings whose values are read, and widths at which costs of the image are read, pixels.
 _PICKED = np.array([1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20, 24, 28])
 _COSTS: Float64Array = np.geomspace(0.3, 9, 14)
 # Costs of a gradient above this are all the same, and so many gradients make a unit.
 _DEAREST, _GRADIENTS = 20.0, 40.0
+# Decibels below which no difference is seen, as in the tables of the benchmarks; and factors that are tried.
+_SEEN, _TRIED = 0.2, 200
 # Standardised values beyond this were hardly seen in training.
 FARTHEST = 4.0
 # Mean of the squared window of SIDE pixels along both axes.
@@ -52,9 +54,11 @@ class LearntBlur:
     """What the networks say about the blur of an image."""
 
     width: Float64Array  # (3,): 16 %, 50 % and 84 % quantiles of the width, pixels
-    exponent: float
-    removed: float  # width of the largest gain, pixels
-    gain: float  # decibels of visible error
+    exponent: float  # of the transfer function
+    # Width, pixels, and exponent of the largest gain, and the gain, decibels of visible error.
+    removed: float
+    removed_exponent: float
+    gain: float
 
 
 def blur_features(
@@ -103,8 +107,10 @@ def blur_features(
     return np.concatenate([np.asarray(row, np.float64) for row in rows])
 
 
-def learnt_blur(features: Float64Array, weights: Mapping[str, NDArray[np.floating]] | None = None) -> LearntBlur:
-    """Evaluate the networks; ``weights`` are those of the package unless others are given."""
+def learnt_blur(
+    features: Float64Array, width: float, weights: Mapping[str, NDArray[np.floating]] | None = None
+) -> LearntBlur:
+    """Evaluate the networks of the package, or others, where the posterior has a width in pixels."""
     weights = _weights() if weights is None else weights
     # What is not known is taken for usual.
     x = np.clip(np.nan_to_num((features - weights["middle"]) / weights["scale"]), -FARTHEST, FARTHEST)
@@ -114,25 +120,21 @@ def learnt_blur(features: Float64Array, weights: Mapping[str, NDArray[np.floatin
         x = x / (1 + np.exp(-x))
     out = np.einsum("nij,nj->ni", weights["w3"], x) + weights["b3"]
     spread = float(np.sqrt(np.mean(np.exp(2 * out[:, 1])) + out[:, 0].var()))
-    middle = float(out[:, 0].mean())
-    exponent = float(np.clip(out[:, 2].mean(), *EXPONENTS))
-    share = (exponent - EXPONENTS[0]) / (EXPONENTS[1] - EXPONENTS[0])
+    quantiles = width * np.exp(out[:, 0].mean() + spread * np.array([-1.0, 0.0, 1.0]))
     gains = out[:, 3:].mean(axis=0).reshape(len(EXPONENTS), -1)
-    removed, gain = _largest((1 - share) * gains[0] + share * gains[1])
-    return LearntBlur(np.exp(middle + spread * np.array([-1.0, 0.0, 1.0])), exponent, removed, gain)
+    gains = gains - gains[:, :1]
+    best = int(gains.max(axis=1).argmax())
+    gain = float(gains[best].max())
+    removed = width * _widest(gains[best], float(quantiles[1]) / width) if gain > _SEEN else 0.0
+    return LearntBlur(quantiles, float(np.clip(out[:, 2].mean(), 1, 2)), removed, EXPONENTS[best], gain)
 
 
-def _largest(gains: Float64Array) -> tuple[float, float]:
-    """Width of the largest gain, by a parabola through the three largest neighbours, and the gain."""
-    at = int(gains.argmax())
-    if at == 0 or gains[at] <= gains[0]:
-        return 0.0, 0.0
-    logs, step = np.log(WIDTHS[1:]), 0.0
-    if 1 < at < len(WIDTHS) - 1:
-        before, here, after = gains[at - 1 : at + 2]
-        step = 0.5 * (before - after) / min(before - 2 * here + after, -1e-9)
-    place = at - 1 + float(np.clip(step, -0.5, 0.5))
-    return float(np.exp(np.interp(place, np.arange(len(logs)), logs))), float(gains[at] - gains[0])
+def _widest(gains: Float64Array, most: float) -> float:
+    """Widest factor whose gain is as good as the largest, and that is at most the one given or that of the largest."""
+    tried = np.linspace(FACTORS[1], FACTORS[-1], _TRIED)
+    found = np.interp(tried, FACTORS, gains)
+    most = max(most, float(tried[found.argmax()]))
+    return float(tried[(found >= found.max() - _SEEN) & (tried <= most)].max())
 
 
 def _spectrum(image: FloatArray) -> Float64Array:

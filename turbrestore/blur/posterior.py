@@ -1,4 +1,4 @@
-"""The blur of a fused image: posterior over air and lens, and the blur that is removed.
+"""The blur of a fused image: posterior over air and lens by the theory of what frames and image show.
 
 Symbols
 -------
@@ -24,13 +24,8 @@ does not blur it.
 
 The air and the lens look alike in 1 and 3, and the air alone varies.
 
-Removal
--------
-The mean of ln H under the posterior is the shape.  Its width is multiplied by the factor, 1.1 at most, that loses least
-on average over the hypotheses, in decibels: the loss is ``Σ_ν ν^(1 − 2.2) (W H − 1)²`` after the Wiener filter W of the
-blur that is removed, for a scene whose power falls as ν^(−2.2).  Too wide a blur amplifies what is left and costs more
-than too narrow a one.  Where the image contradicts the posterior, the geometric mean of this width and of the widest
-that the image allows is removed.
+What is removed, and the width that is reported, are learnt from simulated clips, for which this posterior and all
+that the witnesses measure are the input (:mod:`turbrestore.blur.learnt`).
 
 Constants of the likelihoods were set on simulated clips; ``benchmarks/results/blur_calibration.md`` is of others.
 """
@@ -43,24 +38,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray
+from ..core.noise_spectrum import NoiseSpectrum
 from ..registration.registered_noise import noise_of_frames
-from .psf import Float64Array
+from ..runtime.runtime import DEFAULT, Runtime
+from .learnt import blur_features, learnt_blur
+from .psf import Float64Array, radial_otf
 from .witnesses.hypotheses import LEAST_TRANSFER, Hypotheses, hypotheses, shapes
-from .witnesses.image_evidence import EXPONENTS, ImageEvidence
+from .witnesses.image_evidence import EXPONENTS, ImageEvidence, image_evidence
 from .witnesses.short_exposure import TILT_SPREAD
 from .witnesses.spectral_variation import RINGS, SpectralVariation, measure_variation
 
-# Fidelity of the Wiener filter, and exponent of the power of a scene.
-_FIDELITY, _SCENE = 1500.0, 2.2
-# Share of the energy of the scene that is lost even with the right blur, about as on the clips of the calibration.
-_LEAST_LOSS = 0.02
 # How much less likely the narrowest lens is, as a logarithm, where frames have been moved and hence interpolated.
 _INTERPOLATED = 3.0
-# Factors on the width that are tried.
-_FACTORS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1)
-# Static widths below this are those of the pixels and of the interpolation, and are not removed, pixels.  Where the air
-# has blurred with this probability, of smaller widths the lowest that is likely is removed.
-_LEAST_REMOVED, _SURELY = 0.5, 0.8
 # Widest blur of frames that are not reduced, pixels, and the factors of the others.
 _WIDEST, _REDUCTIONS = 3.0, (2, 4)
 # Widths that are reported.
@@ -94,11 +83,12 @@ class BlurWitnesses:
     variation: SpectralVariation | None = None  # s and s_4, if they could be measured
     diffraction: float | None = None  # λ/D of known optics, pixels
     spread: float | None = None  # standard deviation of ln V, if V is what a measured D/r0 makes
+    frame_noise: NoiseSpectrum | None = None  # of a frame
 
 
 @dataclass(frozen=True, eq=False)
 class BlurPosterior:
-    """Posterior of the blur of a fused image."""
+    """What is known of the blur of a fused image."""
 
     # Width and shape of the blur to remove, pixels; see :func:`turbrestore.blur.psf.blur_otf`.
     removed: float
@@ -111,7 +101,7 @@ class BlurPosterior:
     air: float  # probability that the air has blurred the image
     edge_limited: bool  # whether less is removed because the edges of the image are too steep for more
     frequencies: Float64Array  # (k,): of the arrays that follow, cycles per pixel
-    # (k,): mean transfer function and its 16 % and 84 % quantiles.
+    # (k,): transfer function of the 50 %, 84 % and 16 % quantiles of the width.
     transfer: Float64Array
     lowest: Float64Array
     highest: Float64Array
@@ -132,7 +122,7 @@ def measure_witnesses(frames: FloatArray, flows: FloatArray, mean: FloatArray, k
     Windows of 64 pixels resolve blurs of up to three pixels; for wider ones, frames are reduced.
     """
     noise = noise_of_frames(frames, flows, mean)
-    witnesses = replace(known, variation=measure_variation(frames, flows, noise))
+    witnesses = replace(known, variation=measure_variation(frames, flows, noise), frame_noise=noise)
     for reduction in _REDUCTIONS:
         if blur_posterior(None, witnesses).width[1] <= _WIDEST * reduction / 2:
             break
@@ -141,6 +131,30 @@ def measure_witnesses(frames: FloatArray, flows: FloatArray, mean: FloatArray, k
             break
         witnesses = replace(witnesses, variation=reduced)
     return witnesses
+
+
+def estimate_posterior(
+    image: FloatArray, witnesses: BlurWitnesses, noise: NoiseSpectrum, runtime: Runtime = DEFAULT
+) -> tuple[ImageEvidence | None, BlurPosterior]:
+    """Estimate the blur of an image (H, W) of some noise; none is removed where the image shows nothing."""
+    evidence, variation = image_evidence(image, runtime), witnesses.variation
+    by_theory = blur_posterior(evidence, witnesses, None if variation is None else variation.with_power(image))
+    if evidence is None:
+        return None, by_theory
+    widths = [by_theory.by_displacement, by_theory.by_variation, by_theory.by_image, by_theory.width]
+    facts = by_theory.air, by_theory.exponent, witnesses.displacement, witnesses.independent_frames
+    features = blur_features(image, np.array(widths), variation, evidence, noise, facts)
+    found = learnt_blur(features, float(by_theory.width[1]))
+    highest, transfer, lowest = (radial_otf(by_theory.frequencies, width, found.exponent) for width in found.width)
+    return evidence, replace(
+        by_theory,
+        removed=found.removed,
+        exponent=found.removed_exponent,
+        width=found.width,
+        transfer=transfer,
+        lowest=lowest,
+        highest=highest,
+    )
 
 
 def blur_posterior(
@@ -176,25 +190,15 @@ def blur_posterior(
 
     curves = np.array([np.interp(RINGS * kappa, RINGS, curve) for curve in grid.transfer.reshape(-1, len(RINGS))])
     mean = np.exp(weights.ravel() @ np.log(np.maximum(curves, LEAST_TRANSFER)))
-    width, exponent = _least_loss(curves, weights.ravel(), mean, scale)
-    by_image, whole = quantiles(of_image), _quantiles(kappa * scale * grid.width, weights)
-    width *= scale
-    if by_image[2] < whole[0]:
-        # The mean, in logarithm, with the widest blur by the image where the posterior has only wider ones.
-        width = (width * min(width, float(by_image[2]))) ** 0.5
     low, _, high = np.array([_quantiles(column, weights.ravel()) for column in curves.T]).T
-    air = float(1 - weights[-1].sum())
-    removed = width
-    if width < _LEAST_REMOVED:
-        removed = min(width, float(whole[0])) if air > _SURELY else 0.0
     return BlurPosterior(
-        removed=removed,
-        exponent=exponent,
-        width=whole,
+        removed=0.0,
+        exponent=float(shapes(mean[None])[1][0]),
+        width=_quantiles(kappa * scale * grid.width, weights),
         by_displacement=quantiles(of_v),
         by_variation=quantiles(of_s),
-        by_image=by_image,
-        air=air,
+        by_image=quantiles(of_image),
+        air=float(1 - weights[-1].sum()),
         edge_limited=False,
         frequencies=RINGS / scale,
         transfer=mean,
@@ -212,25 +216,6 @@ def _sharper(grid: Hypotheses, weights: Float64Array, ratio: Float64Array | None
     (before, after), _ = shapes(np.clip(np.stack([mean, mean * ratio]), LEAST_TRANSFER, 1 - 1e-9))
     # Blurs of less than a pixel are not resolved by the ratio.
     return float(np.clip(after / before, 0.6, 1.1)) if mean[-1] < 0.5 and (mean * ratio)[-1] < 0.5 else 1.0
-
-
-def _least_loss(curves: Float64Array, weights: Float64Array, mean: Float64Array, scale: int) -> tuple[float, float]:
-    """Width and exponent of the blur whose removal loses least on average, width 0 if removing none does."""
-    noise = (2 * np.pi * RINGS / scale) ** 2 / _FIDELITY
-    scene = np.append(0.0, RINGS[1:] ** (1 - _SCENE))
-    (width,), (exponent,) = shapes(mean[None])
-
-    def loss(wiener: Float64Array | float) -> float:
-        left = (scene * (wiener * curves - 1) ** 2).sum(axis=1)
-        return float(weights @ np.log(left + _LEAST_LOSS * scene.sum()))
-
-    best, chosen = loss(1.0), 0.0
-    for factor in _FACTORS:
-        otf = np.interp(RINGS * factor, RINGS, mean)
-        value = loss(otf / (otf**2 + noise))
-        if value < best:
-            best, chosen = value, factor
-    return float(chosen * width), float(exponent)
 
 
 def _normalised(logs: Float64Array) -> Float64Array:

@@ -74,6 +74,12 @@ class NoiseSpectrum:
         return float(np.sqrt(self.at(np.hypot(nu[:, None], nu)).mean()))
 
 
+def white_noise(deviation: float) -> NoiseSpectrum:
+    """Return the spectrum of white noise of a known standard deviation."""
+    nothing = np.zeros_like(RINGS)
+    return NoiseSpectrum(np.full_like(RINGS, max(deviation**2, _LEAST)), nothing, nothing)
+
+
 def fit_noise_spectrum(differences: Iterable[FloatArray], scene: FloatArray) -> NoiseSpectrum:
     """Fit N and e to differences, each (H, W), of images of one scene (H, W); see the docstring of the module."""
     of_scene = window_powers(scene)

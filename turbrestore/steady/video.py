@@ -21,10 +21,11 @@ from itertools import chain, islice
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..blur.posterior import BlurWitnesses, blur_posterior, measure_witnesses
+from ..blur.posterior import BlurWitnesses, estimate_posterior, measure_witnesses
 from ..blur.psf import KOLMOGOROV
-from ..blur.witnesses.image_evidence import image_evidence
 from ..core.arrays import FloatArray, luminance
+from ..core.noise import estimate_noise
+from ..core.noise_spectrum import white_noise
 from ..footage.overlays import Title, without_overlay
 from ..footage.survey import take_survey
 from ..io.source import FrameSource
@@ -174,11 +175,10 @@ def _find_blur(image: FloatArray, witnesses: BlurWitnesses, runtime: Runtime) ->
     A window has few frames, and where they are registered badly they seem to vary; edges tell that nothing has blurred.
     """
     grey = luminance(image)
-    evidence = image_evidence(grey, runtime)
+    noise = white_noise(estimate_noise(grey)) if witnesses.frame_noise is None else witnesses.frame_noise
+    evidence, posterior = estimate_posterior(grey, witnesses, noise.scaled(1 / witnesses.independent_frames), runtime)
     if evidence is None:
         return 0.0, KOLMOGOROV
-    ratio = None if witnesses.variation is None else witnesses.variation.with_power(grey)
-    posterior = blur_posterior(evidence, witnesses, ratio)
     return _CAUTION * min(posterior.removed, evidence.estimate.removable), posterior.exponent
 
 

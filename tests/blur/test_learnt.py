@@ -1,0 +1,88 @@
+"""Networks that tell the blur to remove: their evaluation, what they read, and what follows from the gains."""
+
+from importlib.resources import files
+
+import numpy as np
+import pytest
+
+from turbrestore.blur.learnt import EXPONENTS, FACTORS, learnt_blur
+
+FEATURES, INNER, NETWORKS = 5, 4, 3
+
+
+def networks_of(log_width, spread, exponent, gains):
+    """Networks that say the same whatever they read; gains (exponents, factors)."""
+    out = np.concatenate([[log_width, spread, exponent], np.ravel(gains)])
+    shapes = {"1": (INNER, FEATURES), "2": (INNER, INNER), "3": (len(out), INNER)}
+    weights = {f"w{layer}": np.zeros((NETWORKS, *shape)) for layer, shape in shapes.items()}
+    weights |= {"b1": np.zeros((NETWORKS, INNER)), "b2": np.zeros((NETWORKS, INNER)), "b3": np.tile(out, (NETWORKS, 1))}
+    return weights | {"middle": np.zeros(FEATURES), "scale": np.ones(FEATURES)}
+
+
+def peak_at(factor, height=2.0):
+    return np.tile(np.where(FACTORS > 0, height - 8 * np.log(np.maximum(FACTORS, 0.1) / factor) ** 2, 0.0), (2, 1))
+
+
+def test_the_widest_blur_of_the_largest_gain_is_removed_up_to_its_width():
+    # A parabola in the logarithm is within 0.2 dB of its peak up to a ratio of exp(√(0.2 / 8)).
+    for factor, width, expected in ((0.8, 2.0, 0.8 * np.exp(0.158)), (0.8, 0.85, 0.85), (1.35, 1.0, 1.35)):
+        found = learnt_blur(np.zeros(FEATURES), 1.7, networks_of(np.log(width), np.log(0.2), 1.5, peak_at(factor)))
+        assert found.removed == pytest.approx(1.7 * expected, rel=0.05)
+        assert found.exponent == pytest.approx(1.5) and found.gain == pytest.approx(2.0, abs=0.1)
+        assert found.removed_exponent == EXPONENTS[0]
+        np.testing.assert_allclose(found.width, 1.7 * width * np.exp(0.2 * np.array([-1, 0, 1])))
+
+
+def test_nothing_is_removed_where_nothing_gains():
+    for height in (-0.1, 0.1):
+        found = learnt_blur(np.zeros(FEATURES), 1.7, networks_of(0.0, -1.0, 2.0, peak_at(1.0, height)))
+        assert found.removed == 0 and found.gain == pytest.approx(max(height, 0))
+
+
+def test_the_better_exponent_is_removed():
+    low, high = peak_at(0.5, 1.0)[0], peak_at(2.0, 1.5)[0]
+    for gains, exponent, width in (((low, high), EXPONENTS[1], 2.0), ((high, low), EXPONENTS[0], 2.0)):
+        found = learnt_blur(np.zeros(FEATURES), 1.0, networks_of(0.0, -1.0, 1.6, np.stack(gains)))
+        assert found.removed_exponent == exponent and found.removed == pytest.approx(width, rel=0.1)
+        assert found.exponent == pytest.approx(1.6)
+
+
+def test_scatter_of_the_networks_widens_the_interval():
+    weights = networks_of(0.0, np.log(0.2), 2.0, peak_at(1.0))
+    narrow = learnt_blur(np.zeros(FEATURES), 1.0, weights).width
+    weights["b3"][:, 0] = [-0.3, 0.0, 0.3]
+    wide = learnt_blur(np.zeros(FEATURES), 1.0, weights).width
+    assert np.log(wide[2]) == pytest.approx(np.hypot(0.2, np.std([-0.3, 0, 0.3])), rel=1e-6)
+    assert narrow[1] == wide[1] == 1
+
+
+def test_layers_are_those_of_a_perceptron():
+    rng, weights = np.random.default_rng(0), networks_of(0.0, -1.0, 1.6, peak_at(1.0))
+    weights = {name: rng.normal(0, 0.3, values.shape) for name, values in weights.items()} | {
+        "scale": np.ones(FEATURES)
+    }
+    x = rng.normal(0, 1, FEATURES)
+
+    def silu(values):
+        return values / (1 + np.exp(-values))
+
+    logs = []
+    for number in range(NETWORKS):
+        w1, w2, w3 = (weights[f"w{layer}"][number] for layer in (1, 2, 3))
+        b1, b2, b3 = (weights[f"b{layer}"][number] for layer in (1, 2, 3))
+        logs.append((w3 @ silu(w2 @ silu(w1 @ (x - weights["middle"]) + b1) + b2) + b3)[0])
+    assert np.log(learnt_blur(x, 1.0, weights).width[1]) == pytest.approx(np.mean(logs))
+
+
+def test_what_is_not_known_is_taken_for_usual():
+    weights = networks_of(0.0, -1.0, 1.6, peak_at(1.0))
+    weights["w1"][:] = weights["w2"][:] = weights["w3"][:] = 0.3
+    weights["middle"] = np.arange(FEATURES, dtype=float)
+    known = learnt_blur(weights["middle"], 1.0, weights)
+    unknown = learnt_blur(np.full(FEATURES, np.nan), 1.0, weights)
+    np.testing.assert_array_equal(known.width, unknown.width)
+
+
+def test_the_file_of_the_weights_is_small():
+    path = files("turbrestore.blur").joinpath("learnt_blur.npz")
+    assert len(path.read_bytes()) < 300_000
