@@ -122,8 +122,12 @@ def test_a_wide_blur_that_stands_still_is_found(sigma):
     frames, flows = still_clip(cv2.GaussianBlur(SCENES["camera"](256, 256), (0, 0), sigma))
     image = frames.mean(axis=0)
     witnesses = measure_witnesses(frames, flows, image, BlurWitnesses(0.0, 12.0))
+    evidence = image_evidence(image)
+    by_theory = blur_posterior(evidence, witnesses, witnesses.variation.with_power(image))
+    assert by_theory.width[1] == pytest.approx(sigma, rel=0.3)
     _, found = estimate_posterior(image, witnesses, white_noise(0.004 / 12**0.5))
-    assert found.width[1] == pytest.approx(sigma, rel=0.3) and 0.4 * sigma < found.removed < 1.2 * sigma
+    # Most training clips are blurred by less than six pixels, so more is taken for less.
+    assert 0.6 * sigma < found.width[1] < 1.3 * sigma and 0.4 * sigma < found.removed < 1.2 * sigma
 
 
 def test_one_wrong_witness_is_outvoted():
