@@ -126,8 +126,9 @@ def test_a_wide_blur_that_stands_still_is_found(sigma):
     by_theory = blur_posterior(evidence, witnesses, witnesses.variation.with_power(image))
     assert by_theory.width[1] == pytest.approx(sigma, rel=0.3)
     _, found = estimate_posterior(image, witnesses, white_noise(0.004 / 12**0.5))
-    # Most training clips are blurred by less than six pixels, so more is taken for less.
-    assert 0.6 * sigma < found.width[1] < 1.3 * sigma and 0.4 * sigma < found.removed < 1.2 * sigma
+    assert 0.6 * sigma < found.width[1] < 1.3 * sigma
+    # Hardly any training clip is blurred by more than six pixels: what is not known to gain is not removed.
+    assert 0.4 * sigma < found.removed < 1.2 * sigma or (sigma > 6 and found.removed == 0)
 
 
 def test_one_wrong_witness_is_outvoted():
