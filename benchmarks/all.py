@@ -68,6 +68,7 @@ TABLES = {
     "speed": Table("speed.py", timed=True),
     "tvl1": Table("tvl1.py --quick", timed=True),
     "memory": Table("memory.py --quick", timed=True),
+    "blur_training": Table("blur_training.py", missing=lambda: "its clips take hours, and its networks are kept"),
     "device": Table("device.py --device cuda --size 1080 1920 --frames 100 --runs 1", timed=True, missing=_gpu),
 }
 

@@ -30,7 +30,7 @@ from provenance import publish
 from turbrestore import DeconvolutionParams, TurbrestoreError, pipeline
 from turbrestore.blind import remove_blur
 from turbrestore.blur import posterior
-from turbrestore.blur.learnt import EXPONENTS, FACTORS, FARTHEST, LearntBlur, blur_features, learnt_blur
+from turbrestore.blur.learnt import EXPONENTS, FACTORS, FARTHEST, LOG_SPREADS, LearntBlur, blur_features, learnt_blur
 from turbrestore.blur.psf import radial_otf
 from turbrestore.blur.witnesses.spectral_variation import RINGS, SIDE
 from turbrestore.core.arrays import FloatArray
@@ -82,12 +82,14 @@ def main() -> int:
 def make_clips(folder: Path, first: int, last: int, simulator: str | None, smooth: bool) -> None:
     """Simulate clips, and keep what is known of each in a file of the folder."""
     for seed in range(first, last):
-        path = folder / f"{seed}.pkl"
+        path = folder / f"{simulator or 'any'}{'_smooth' * smooth}_{seed}.pkl"
         if not path.exists():
             begun = time.perf_counter()
             clip = simulate(seed, simulator, smooth)
             found = known_of(clip)
-            path.write_bytes(pickle.dumps({"seed": seed, "simulator": clip.simulator, "scene": clip.scene, **found}))
+            partial = path.with_suffix(".part")
+            partial.write_bytes(pickle.dumps({"seed": seed, "simulator": clip.simulator, "scene": clip.scene, **found}))
+            partial.replace(path)
             seconds = time.perf_counter() - begun
             print(seed, clip.simulator, clip.scene, clip.frames.shape, f"{seconds:.1f} s", flush=True)
 
@@ -226,7 +228,7 @@ def _train_one(x: torch.Tensor, y: torch.Tensor, seed: int) -> torch.nn.Sequenti
         for batch in torch.randperm(len(x)).split(BATCH):
             out = network(x[batch] + 0.05 * torch.randn_like(x[batch]))
             width, exponent, gains = y[batch, 0], y[batch, 1], y[batch, 2:]
-            log = out[:, 1].clamp(-3, 1)
+            log = out[:, 1].clamp(*LOG_SPREADS)
             likelihood = (0.5 * torch.square((width - out[:, 0]) / log.exp()) + log).mean()
             loss = torch.square(out[:, 3:] - gains).mean() + 0.1 * likelihood
             loss = loss + 0.1 * torch.square(out[:, 2] - exponent).mean()
@@ -253,21 +255,17 @@ def table_of(clips: TrainingClips) -> str:
     ]
     rng = np.random.default_rng(0)
     folds = rng.integers(0, 5, len(clips.simulators))
+    found: dict[int, LearntBlur] = {}
     for name in sorted(set(clips.simulators)):
         held = clips.simulators == name
         weights = train_networks(clips, ~held)
-        lines.append(
-            _row(
-                name,
-                clips,
-                held,
-                {
-                    place: learnt_blur(clips.features[place], clips.usual[place], weights)
-                    for place in np.flatnonzero(held)
-                },
-            )
-        )
-    found: dict[int, LearntBlur] = {}
+        found |= {
+            place: learnt_blur(clips.features[place], clips.usual[place], weights) for place in np.flatnonzero(held)
+        }
+        lines.append(_row(name, clips, held, found))
+    every = np.ones(len(folds), bool)
+    lines.append(_row("each", clips, every, found))
+    found = {}
     for fold in range(5):
         weights = train_networks(clips, folds != fold)
         found |= {
@@ -276,7 +274,7 @@ def table_of(clips: TrainingClips) -> str:
         }
     for name in sorted(set(clips.simulators)):
         lines.append(_row(f"a fifth, {name}", clips, clips.simulators == name, found))
-    lines.append(_row("a fifth", clips, np.ones(len(folds), bool), found))
+    lines.append(_row("a fifth", clips, every, found))
     return "\n".join(lines) + "\n"
 
 

@@ -2,10 +2,14 @@
 
 from importlib.resources import files
 
+import cv2
 import numpy as np
 import pytest
 
 from turbrestore.blur.learnt import EXPONENTS, FACTORS, learnt_blur
+from turbrestore.blur.posterior import BlurWitnesses, estimate_posterior, measure_witnesses
+from turbrestore.core.noise_spectrum import white_noise
+from turbrestore.synthesis.scenes import SCENES
 
 FEATURES, INNER, NETWORKS = 5, 4, 3
 
@@ -28,15 +32,14 @@ def test_the_widest_blur_of_the_largest_gain_is_removed_up_to_its_width():
     for factor, width, expected in ((0.8, 2.0, 0.8 * np.exp(0.158)), (0.8, 0.85, 0.85), (1.35, 1.0, 1.35)):
         found = learnt_blur(np.zeros(FEATURES), 1.7, networks_of(np.log(width), np.log(0.2), 1.5, peak_at(factor)))
         assert found.removed == pytest.approx(1.7 * expected, rel=0.05)
-        assert found.exponent == pytest.approx(1.5) and found.gain == pytest.approx(2.0, abs=0.1)
-        assert found.removed_exponent == EXPONENTS[0]
+        assert found.exponent == pytest.approx(1.5) and found.removed_exponent == EXPONENTS[0]
         np.testing.assert_allclose(found.width, 1.7 * width * np.exp(0.2 * np.array([-1, 0, 1])))
 
 
 def test_nothing_is_removed_where_nothing_gains():
     for height in (-0.1, 0.1):
         found = learnt_blur(np.zeros(FEATURES), 1.7, networks_of(0.0, -1.0, 2.0, peak_at(1.0, height)))
-        assert found.removed == 0 and found.gain == pytest.approx(max(height, 0))
+        assert found.removed == 0 and found.removed_exponent == found.exponent == 2
 
 
 def test_the_better_exponent_is_removed():
@@ -81,6 +84,20 @@ def test_what_is_not_known_is_taken_for_usual():
     known = learnt_blur(weights["middle"], 1.0, weights)
     unknown = learnt_blur(np.full(FEATURES, np.nan), 1.0, weights)
     np.testing.assert_array_equal(known.width, unknown.width)
+
+
+@pytest.mark.parametrize("side", [40, 128])
+def test_networks_read_what_is_measured(side):
+    rng = np.random.default_rng(0)
+    scene = cv2.GaussianBlur(SCENES["camera"](side, side), (0, 0), 1.2)
+    frames = (scene + rng.normal(0, 0.01, (8, side, side))).astype(np.float32)
+    known = BlurWitnesses(0.0, 8.0)
+    measured = measure_witnesses(frames, np.zeros((*frames.shape, 2), np.float32), frames.mean(0), known)
+    assert (measured.variation is None) == (side == 40)
+    for witnesses in (measured, known):
+        _, found = estimate_posterior(frames.mean(axis=0), witnesses, white_noise(0.01 / 8**0.5))
+        assert np.isfinite(found.width).all() and found.removed >= 0
+        assert (np.diff(found.width) > 0).all() and 0.4 < found.width[1] < 4
 
 
 def test_the_file_of_the_weights_is_small():

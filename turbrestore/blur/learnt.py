@@ -11,8 +11,9 @@ G : gain, decibels, by which the visible error ``e² + e_0²`` falls where a blu
 A few small networks, trained alike from different starts, map x to ln σ with its deviation, to p and to G on a grid of
 widths for two exponents; widths are relative to that of the posterior, which is about right at every scale.  Their mean
 counts, and their scatter adds to the deviation.  Of the blurs whose G is as good as the largest, but for a difference
-that is not seen, the widest up to σ is removed; none is where all of G is too small to be seen.  So it is no wider than
-the noise allows, and narrower than σ where that is doubtful and too wide a blur would cost more than too narrow a one.
+that is not seen, the widest is removed that is no wider than σ or than the best; none is, where all of G is too small
+to be seen.  So it is no wider than the noise allows, and narrower than σ where that is doubtful and too wide a blur
+would cost more than too narrow a one.
 
 ``python benchmarks/blur_training.py`` makes the clips, trains and judges the networks, and writes ``learnt_blur.npz``.
 """
@@ -43,6 +44,8 @@ _COSTS: Float64Array = np.geomspace(0.3, 9, 14)
 _DEAREST, _GRADIENTS = 20.0, 40.0
 # Decibels below which no difference is seen, as in the tables of the benchmarks; and factors that are tried.
 _SEEN, _TRIED = 0.2, 200
+# Least and largest logarithm of the deviation that a network is trained to say.
+LOG_SPREADS = (-3.0, 1.0)
 # Standardised values beyond this were hardly seen in training.
 FARTHEST = 4.0
 # Mean of the squared window of SIDE pixels along both axes.
@@ -55,10 +58,9 @@ class LearntBlur:
 
     width: Float64Array  # (3,): 16 %, 50 % and 84 % quantiles of the width, pixels
     exponent: float  # of the transfer function
-    # Width, pixels, and exponent of the largest gain, and the gain, decibels of visible error.
+    # Width, pixels, and exponent of the blur to remove; width 0 and the exponent above if none gains.
     removed: float
     removed_exponent: float
-    gain: float
 
 
 def blur_features(
@@ -119,14 +121,16 @@ def learnt_blur(
         x = np.einsum("nij,nj->ni", weights[f"w{layer}"], x) + weights[f"b{layer}"]
         x = x / (1 + np.exp(-x))
     out = np.einsum("nij,nj->ni", weights["w3"], x) + weights["b3"]
-    spread = float(np.sqrt(np.mean(np.exp(2 * out[:, 1])) + out[:, 0].var()))
+    spread = float(np.sqrt(np.mean(np.exp(2 * np.clip(out[:, 1], *LOG_SPREADS))) + out[:, 0].var()))
     quantiles = width * np.exp(out[:, 0].mean() + spread * np.array([-1.0, 0.0, 1.0]))
     gains = out[:, 3:].mean(axis=0).reshape(len(EXPONENTS), -1)
     gains = gains - gains[:, :1]
     best = int(gains.max(axis=1).argmax())
-    gain = float(gains[best].max())
-    removed = width * _widest(gains[best], float(quantiles[1]) / width) if gain > _SEEN else 0.0
-    return LearntBlur(quantiles, float(np.clip(out[:, 2].mean(), 1, 2)), removed, EXPONENTS[best], gain)
+    exponent = float(np.clip(out[:, 2].mean(), 1, 2))
+    if gains[best].max() <= _SEEN:
+        return LearntBlur(quantiles, exponent, 0.0, exponent)
+    removed = width * _widest(gains[best], float(quantiles[1]) / width)
+    return LearntBlur(quantiles, exponent, removed, EXPONENTS[best])
 
 
 def _widest(gains: Float64Array, most: float) -> float:
@@ -151,5 +155,5 @@ def _log(values: object, least: float) -> Float64Array:
 def _weights() -> dict[str, Float64Array]:
     """Layers of the networks (n, outputs, inputs), and middle and scale of the features."""
     path = files("turbrestore.blur").joinpath("learnt_blur.npz")
-    with path.open("rb") as stream, np.load(stream) as held:
+    with path.open("rb") as stream, np.load(stream, allow_pickle=False) as held:
         return {name: held[name].astype(np.float64) for name in held.files}

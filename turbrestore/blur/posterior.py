@@ -101,7 +101,7 @@ class BlurPosterior:
     air: float  # probability that the air has blurred the image
     edge_limited: bool  # whether less is removed because the edges of the image are too steep for more
     frequencies: Float64Array  # (k,): of the arrays that follow, cycles per pixel
-    # (k,): transfer function of the 50 %, 84 % and 16 % quantiles of the width.
+    # (k,): transfer function, and its 16 % and 84 % quantiles; of a fused image, those of the quantiles of the width.
     transfer: Float64Array
     lowest: Float64Array
     highest: Float64Array

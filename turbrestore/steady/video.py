@@ -175,8 +175,10 @@ def _find_blur(image: FloatArray, witnesses: BlurWitnesses, runtime: Runtime) ->
     A window has few frames, and where they are registered badly they seem to vary; edges tell that nothing has blurred.
     """
     grey = luminance(image)
-    noise = white_noise(estimate_noise(grey)) if witnesses.frame_noise is None else witnesses.frame_noise
-    evidence, posterior = estimate_posterior(grey, witnesses, noise.scaled(1 / witnesses.independent_frames), runtime)
+    noise = white_noise(estimate_noise(grey))
+    if witnesses.frame_noise is not None:
+        noise = witnesses.frame_noise.scaled(1 / witnesses.independent_frames)
+    evidence, posterior = estimate_posterior(grey, witnesses, noise, runtime)
     if evidence is None:
         return 0.0, KOLMOGOROV
     return _CAUTION * min(posterior.removed, evidence.estimate.removable), posterior.exponent
