@@ -55,6 +55,15 @@ class TestArrays:
         np.testing.assert_array_equal(np.rint(source.read() * 255), frames)
         assert len(source.warnings) == last
 
+    def test_square_frames_come_last_where_they_are_a_little_more_alike(self, tmp_path):
+        """A fence whose rows resemble each other nearly as much as the frames do."""
+        rng = np.random.default_rng(0)
+        fence, texture = rng.standard_normal((1, 60, 1)), 0.35 * rng.standard_normal((60, 60, 1))
+        frames = fence + texture + 0.28 * rng.standard_normal((60, 60, 20))
+        np.save(tmp_path / "a.npy", np.uint8(127 + 40 * frames.clip(-2, 2)))
+        source = open_frames(tmp_path / "a.npy")
+        assert source.shape == (20, 60, 60) and "(H, W, T)" in source.warnings[0]
+
     def test_square_frames_come_first_whatever_they_show(self, tmp_path):
         """A disc beside the middle, turned by 180° in half of the frames: its planes along x are the most alike."""
         y, x = np.mgrid[:60, :60]

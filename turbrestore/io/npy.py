@@ -191,7 +191,9 @@ def _frames_last(array: NDArray[Any]) -> bool:
     for axis in (0, 2, 0, 2):
         level = np.abs(block.mean(axis=tuple(other for other in range(3) if other != axis), keepdims=True))
         block = block / np.maximum(level, np.finfo(float).tiny)
-    return _likeness(block, 2) > _MORE_ALIKE * _likeness(block, 0)
+    # Square frames at the end make the first two axes, and no others, equally long.
+    factor = 1.0 if array.shape[0] == array.shape[1] != array.shape[2] else _MORE_ALIKE
+    return _likeness(block, 2) > factor * _likeness(block, 0)
 
 
 def _likeness(block: NDArray[np.float64], axis: int) -> float:
