@@ -9,7 +9,8 @@
 ``none``      sharp or soft scenes that smooth flows move or that stand still
 
 Scenes are those that no other benchmark shows: dead leaves (Lee, Mumford and Huang 2001), random text and bars, and
-photographs of scikit-image and scikit-learn (``pip install scikit-learn``).  A camera then adds noise, sharpens or smooths, and compresses.
+photographs of scikit-image and scikit-learn, which is to be installed for them.  A camera then adds noise, sharpens or
+smooths, and compresses.
 """
 
 from __future__ import annotations
