@@ -105,7 +105,7 @@ def known_of(clip: SimulatedClip) -> dict[str, object]:
 
     def spy_features(*given: object) -> object:
         known["features"] = blur_features(*given)
-        known["image"], known["noise"] = given[0], given[4]
+        known["image"], known["noise"] = given[0], given[5]
         raise _ReachedError
 
     prepare = pipeline.prepare

@@ -67,15 +67,17 @@ def blur_features(
     image: FloatArray,
     widths: NDArray[np.floating],
     variation: SpectralVariation | None,
+    ratio: Float64Array | None,
     evidence: ImageEvidence,
     noise: NoiseSpectrum,
     facts: tuple[float, float, float, float],
 ) -> Float64Array:
     """Return what the networks read, NaN where it is not known.
 
-    ``image`` (H, W); ``widths`` are the quantiles by the witnesses and by their posterior, pixels; ``noise`` is that of
-    the image; ``facts`` are the probability of air, the exponent of the posterior, the variance of the displacement and
-    the number of independent frames.
+    ``image`` (H, W); ``widths`` are the quantiles by the witnesses and by their posterior, pixels; ``ratio`` is that of
+    the spectrum of the image to that of the mean of the frames; ``noise`` is that of the image; ``facts`` are the
+    probability of air, the exponent of the posterior, the variance of the displacement and the number of independent
+    frames.
     """
     air, exponent, displacement, frames = facts
     unknown = np.full(len(_PICKED), np.nan)
@@ -90,7 +92,7 @@ def blur_features(
         _log([float(image.std())], 1e-4),
         _log([of_noise[4] / of_noise[20]], 1e-3),
     ]
-    if variation is None:
+    if variation is None or ratio is None:
         rows += [[np.nan, np.nan], unknown, unknown, unknown, unknown]
     else:
         rows += [
@@ -98,7 +100,7 @@ def blur_features(
             _log(variation.amplitude, 1e-4)[_PICKED],
             _log(variation.power, 1e-4)[_PICKED],
             np.clip(_log(variation.signal, 1e-2), -3, 9)[_PICKED],
-            _log(variation.with_power(image), 0.05)[_PICKED],
+            _log(ratio, 0.05)[_PICKED],
         ]
     costs, estimate = evidence.costs - evidence.costs.min(), evidence.estimate
     for curve in costs:

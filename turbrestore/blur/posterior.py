@@ -138,12 +138,13 @@ def estimate_posterior(
 ) -> tuple[ImageEvidence | None, BlurPosterior]:
     """Estimate the blur of an image (H, W) of some noise; none is removed where the image shows nothing."""
     evidence, variation = image_evidence(image, runtime), witnesses.variation
-    by_theory = blur_posterior(evidence, witnesses, None if variation is None else variation.with_power(image))
+    ratio = None if variation is None else variation.with_power(image)
+    by_theory = blur_posterior(evidence, witnesses, ratio)
     if evidence is None:
         return None, by_theory
     widths = [by_theory.by_displacement, by_theory.by_variation, by_theory.by_image, by_theory.width]
     facts = by_theory.air, by_theory.exponent, witnesses.displacement, witnesses.independent_frames
-    features = blur_features(image, np.array(widths), variation, evidence, noise, facts)
+    features = blur_features(image, np.array(widths), variation, ratio, evidence, noise, facts)
     found = learnt_blur(features, float(by_theory.width[1]))
     highest, transfer, lowest = (radial_otf(by_theory.frequencies, width, found.exponent) for width in found.width)
     return evidence, replace(
