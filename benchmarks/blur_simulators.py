@@ -5,22 +5,24 @@
 ``lens``      one Gaussian, disc or square for the whole clip, moved by smooth flows or not at all
 ``mixed``     Gaussians whose width changes from place to place and from frame to frame
 ``near``      the latter with blur of 3 to 8 pixels and long displacements, as of air that is close to the camera
-``close``     kernels of 2 to 6 pixels and long displacements, more alike from place to place; not among random draws
+``close``     kernels of 2 to 6 pixels and long displacements, more alike from place to place
 ``none``      sharp or soft scenes that smooth flows move or that stand still
 
-Scenes are those that no other benchmark shows: dead leaves (Lee, Mumford and Huang 2001), random text and bars, and
-photographs of scikit-image and scikit-learn, which is to be installed for them.  A camera then adds noise, sharpens or
-smooths, and compresses.
+Scenes are those that no other benchmark shows: dead leaves (Lee, Mumford and Huang 2001), random text and bars, craters
+in low light, and photographs that come with Python packages, which are installed for them by
+``pip install --no-deps scikit-learn PyWavelets imgaug mahotas pyvista``.  A quarter of the scenes is soft.  A camera
+then adds noise, sharpens or smooths, burns in a title, and compresses.
 """
 
 from __future__ import annotations
 
 import string
 from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
 
 import cv2
 import numpy as np
-import skimage.data
 from blur_clips import h264
 
 from turbrestore.core.arrays import FloatArray
@@ -31,9 +33,19 @@ from turbrestore.synthesis.atmosphere import PhaseScreenParams
 from turbrestore.synthesis.sequence import CameraParams
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
 
-PHOTOGRAPHS = ("gravel", "hubble_deep_field", "immunohistochemistry", "colorwheel", "china", "flower")
-# Simulators and their shares of the clips.
-SHARES = {"screens": 0.3, "kernels": 0.2, "lens": 0.15, "mixed": 0.15, "near": 0.08, "none": 0.12, "close": 0.0}
+# Packages and their photographs.
+PHOTOGRAPHS = {
+    "skimage": ("gravel.png", "hubble_deep_field.jpg", "ihc.png", "color.png", "motorcycle_left.png"),
+    "sklearn": ("china.jpg", "flower.jpg"),
+    "matplotlib": ("grace_hopper.jpg",),
+    "pywt": ("aero.npz", "ascent.npz"),
+    "imgaug": ("quokka.jpg",),
+    "mahotas": ("DepartmentStore.jpg", "nuclear.png"),
+    "pyvista": ("2k_earth_daymap.jpg",),
+}
+# Kinds of scenes, simulators, and their shares of the clips.
+SCENES = {"leaves": 0.35, "text": 0.13, "bars": 0.05, "craters": 0.12, "photograph": 0.35}
+SHARES = {"screens": 0.27, "kernels": 0.18, "lens": 0.17, "mixed": 0.13, "near": 0.07, "none": 0.13, "close": 0.05}
 # Pixels around a clip from which displacement brings in what the frame does not show at rest.
 MARGIN = 32
 # Widths of the stack of blurred scenes that ``mixed`` interpolates.
@@ -50,24 +62,27 @@ class SimulatedClip:
     truth: FloatArray
 
 
-def simulate(seed: int, simulator: str | None = None, smooth: bool = False) -> SimulatedClip:
-    """Draw everything about a clip from a seed, unless the simulator is given or strong smooth noise is asked for."""
+def simulate(seed: int) -> SimulatedClip:
+    """Draw everything about a clip from a seed."""
     rng = np.random.default_rng(seed)
-    drawn = str(rng.choice(list(SHARES), p=list(SHARES.values())))
-    simulator = simulator or drawn
+    simulator = str(rng.choice(list(SHARES), p=list(SHARES.values())))
     side = int(rng.integers(168, 224)) if simulator in ("near", "close") else int(rng.integers(112, 177))
-    name = str(rng.choice(["leaves", "text", "bars", "photograph"], p=[0.5, 0.15, 0.05, 0.3]))
+    name = str(rng.choice(list(SCENES), p=list(SCENES.values())))
     scene = draw_scene(name, side + 2 * MARGIN, rng)
-    count = int(np.exp(rng.uniform(np.log(6), np.log(60))))
+    count = int(np.exp(rng.uniform(np.log(4), np.log(100))))
     frames, truth = _SIMULATORS[simulator](scene, count, rng)
-    return SimulatedClip(simulator, name, (smoothly_noisy if smooth else record)(frames, rng), truth)
+    if rng.uniform() < 0.1:
+        _burn_in_title([*frames, truth], rng)
+    camera = smoothly_noisy if rng.uniform() < 0.12 else record
+    return SimulatedClip(simulator, name, camera(frames, rng), truth)
 
 
 def draw_scene(name: str, side: int, rng: np.random.Generator) -> FloatArray:
     """Draw a grey square of this side with a contrast that can be seen."""
-    scene = {"leaves": _leaves, "text": _text, "bars": _bars, "photograph": _photograph}[name](side, rng)
+    draw = {"leaves": _leaves, "text": _text, "bars": _bars, "craters": _craters, "photograph": _photograph}
+    scene = draw[name](side, rng)
     if rng.uniform() < 0.25:
-        scene = cv2.GaussianBlur(scene, (0, 0), float(rng.uniform(0.3, 1.0)))
+        scene = cv2.GaussianBlur(scene, (0, 0), float(np.exp(rng.uniform(np.log(0.3), np.log(2.0)))))
     if rng.uniform() < 0.3:
         scene = np.float32(rng.uniform(0, 0.4)) + np.float32(rng.uniform(0.15, 0.6)) * scene
     contrast = float(scene.std())
@@ -122,20 +137,55 @@ def _bars(side: int, rng: np.random.Generator) -> FloatArray:
     return image
 
 
-def _photograph(side: int, rng: np.random.Generator) -> FloatArray:
-    name = str(rng.choice(PHOTOGRAPHS))
-    if name in ("china", "flower"):
-        from sklearn.datasets import load_sample_image
+def _craters(side: int, rng: np.random.Generator) -> FloatArray:
+    """Rough ground with craters of all sizes, lit from low above."""
+    nu = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.fftfreq(side))
+    rough = np.fft.ifft2(np.fft.fft2(rng.standard_normal((side, side))) * (nu + 1 / side) ** -rng.uniform(1.4, 2.2)).real
+    height = rng.uniform(0.5, 3) * rough / rough.std()
+    y, x = np.mgrid[:side, :side]
+    for _ in range(int(rng.choice([20, 80, 300]))):
+        radius = min(2.0 * rng.uniform() ** (-1 / 1.7), side / 4)
+        away = np.hypot(y - rng.uniform(0, side), x - rng.uniform(0, side)) / radius
+        rim = np.exp(-np.square((away - 1) / 0.2))
+        height += radius * rng.uniform(0.1, 0.4) * (0.5 * rim - np.clip(1 - away**2, 0, 1))
+    down, across = np.gradient(height)
+    turn, low = rng.uniform(0, 2 * np.pi), float(rng.uniform(0.3, 1.5))
+    lit = (low - np.cos(turn) * across - np.sin(turn) * down) / np.sqrt(1 + across**2 + down**2)
+    bright = np.clip(lit, 0, None) * (1 + 0.15 * np.roll(rough, side // 2, 0) / rough.std())
+    return np.float32(np.clip(rng.uniform(0.5, 0.9) * bright / np.quantile(bright, 0.98), 0, 1))
 
-        image = load_sample_image(f"{name}.jpg")
-    else:
-        image = getattr(skimage.data, name)()
-    grey = cv2.cvtColor(image[..., :3], cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
-    grey = np.float32(grey) / 255
+
+def _photograph(side: int, rng: np.random.Generator) -> FloatArray:
+    package = str(rng.choice(list(PHOTOGRAPHS), p=[0.3, 0.14, 0.1, 0.14, 0.1, 0.12, 0.1]))
+    name, spec = str(rng.choice(PHOTOGRAPHS[package])), find_spec(package)
+    if spec is None or spec.origin is None:
+        raise SystemExit(f"{package} holds photographs of the training clips; install it: see {Path(__file__).name}")
+    path = next(Path(spec.origin).parent.rglob(name))
+    image = np.load(path)["data"].astype(np.uint8) if path.suffix == ".npz" else cv2.imread(str(path), 0)
+    if image is None:
+        raise SystemExit(f"{path} cannot be read as an image")
+    grey = np.float32(image) / 255
     scale = max(float(rng.choice([0.5, 0.7, 1.0])), (side + 1) / min(grey.shape))
     grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
     y, x = (int(rng.integers(0, length - side + 1)) for length in grey.shape)
     return grey[y : y + side, x : x + side]
+
+
+def _burn_in_title(images: list[FloatArray], rng: np.random.Generator) -> None:
+    """Write the same bright words on images, in a dark box half of the time."""
+    height, width = images[0].shape
+    word = "".join(rng.choice(list(string.ascii_uppercase + string.digits + ":-"), int(rng.integers(4, 9))))
+    size, box = float(rng.uniform(0.35, 0.6)), rng.uniform() < 0.5
+    (across, down), _ = cv2.getTextSize(word, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+    left = int(rng.integers(4, max(5, width - across - 4)))
+    base = int(rng.choice([down + 5, height - 6]))
+    ink = np.zeros((height, width), np.uint8)
+    cv2.putText(ink, word, (left, base), cv2.FONT_HERSHEY_SIMPLEX, size, 255, 1, cv2.LINE_AA)
+    share = ink.astype(np.float32) / 255
+    for image in images:
+        if box:
+            image[max(base - down - 4, 0) : base + 5, max(left - 3, 0) : left + across + 4] = 0.05
+        image += share * (0.95 - image)
 
 
 def _screens(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -185,7 +235,7 @@ def _speckles(width: float, rng: np.random.Generator) -> FloatArray:
 
 
 def _lens(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    blurred = _optics(scene, float(np.exp(rng.uniform(np.log(0.4), np.log(4)))), rng)
+    blurred = _optics(scene, float(np.exp(rng.uniform(np.log(0.4), np.log(7)))), rng)
     flows = _flows(count, scene.shape, rng)
     if rng.uniform() < 0.25:
         flows = np.zeros_like(flows)
@@ -281,7 +331,7 @@ def _wandering(
 
 def record(frames: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Frames as a camera keeps them: noise, its reduction or sharpening, H.264 or HEVC, eight bits."""
-    noise = float(np.exp(rng.uniform(np.log(0.002), np.log(0.05))))
+    noise = float(np.exp(rng.uniform(np.log(0.001), np.log(0.06))))
     level = np.sqrt(np.maximum(frames, 0.02)) / 0.7 if rng.uniform() < 0.4 else 1.0
     kind, grain = str(rng.choice(["white", "smooth", "reduced"], p=[0.6, 0.2, 0.2])), rng.standard_normal(frames.shape)
     if kind == "smooth":

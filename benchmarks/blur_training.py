@@ -24,7 +24,7 @@ from unittest.mock import patch
 import numpy as np
 import torch
 from blur_calibration import CORE, registered
-from blur_simulators import SHARES, SimulatedClip, simulate
+from blur_simulators import SimulatedClip, simulate
 from provenance import publish
 
 from turbrestore import DeconvolutionParams, TurbrestoreError, pipeline
@@ -42,7 +42,7 @@ WEIGHTS = Path(__file__).resolve().parent.parent / "turbrestore" / "blur" / "lea
 # Mean squared error that is invisible, decibels below which a loss is as bad as any other, and unit of the networks.
 INVISIBLE, WORST, UNIT = 10**-3.8, -8.0, 3.0
 # Widths that are removed, pixels.
-WIDTHS = np.array([0, 0.35, 0.5, 0.7, 0.95, 1.25, 1.65, 2.2, 2.9, 3.9, 5.4, 7.5])
+WIDTHS = np.array([0, 0.35, 0.5, 0.7, 0.95, 1.25, 1.65, 2.2, 2.9, 3.9, 5.4, 7.5, 10.0])
 # Iterations that tell which blur is best; and a loss after which wider blurs are not tried, as a ratio of errors.
 ITERATIONS, HOPELESS = 8, 4.0
 # Place of the width of the posterior among the features.
@@ -64,13 +64,11 @@ def main() -> int:
         kind.add_argument("folder", type=Path)
     make.add_argument("first", type=int)
     make.add_argument("last", type=int)
-    make.add_argument("--simulator", choices=SHARES)
-    make.add_argument("--smooth", action="store_true", help="strong smooth noise")
     train.add_argument("--write", type=Path)
     given = parser.parse_args()
     if given.what == "make":
         given.folder.mkdir(exist_ok=True)
-        make_clips(given.folder, given.first, given.last, given.simulator, given.smooth)
+        make_clips(given.folder, given.first, given.last)
         return 0
     clips = read_clips(given.folder)
     publish(table_of(clips), given.write)
@@ -79,13 +77,13 @@ def main() -> int:
     return 0
 
 
-def make_clips(folder: Path, first: int, last: int, simulator: str | None, smooth: bool) -> None:
+def make_clips(folder: Path, first: int, last: int) -> None:
     """Simulate clips, and keep what is known of each in a file of the folder."""
     for seed in range(first, last):
-        path = folder / f"{simulator or 'any'}{'_smooth' * smooth}_{seed}.pkl"
+        path = folder / f"{seed}.pkl"
         if not path.exists():
             begun = time.perf_counter()
-            clip = simulate(seed, simulator, smooth)
+            clip = simulate(seed)
             found = known_of(clip)
             partial = path.with_suffix(".part")
             partial.write_bytes(pickle.dumps({"seed": seed, "simulator": clip.simulator, "scene": clip.scene, **found}))
