@@ -170,7 +170,7 @@ def _photograph(side: int, rng: np.random.Generator) -> FloatArray:
     y, x = (int(rng.integers(0, length - side + 1)) for length in grey.shape)
     part = grey[y : y + side, x : x + side]
     # Some parts show nothing but the sea.
-    return part if part.std() > 0.02 else _photograph(side, rng)
+    return part if part[MARGIN:-MARGIN, MARGIN:-MARGIN].std() > 0.02 else _photograph(side, rng)
 
 
 def _burn_in_title(images: list[FloatArray], rng: np.random.Generator) -> None:
