@@ -113,7 +113,7 @@ def open_tab(window, app):
         if not page.is_closed():
             page.wait_for_function(COMPLETE)
         page.close()
-    assert complaints == []
+    assert not complaints, "\n".join(complaints)
     assert [address for address in addresses if not address.startswith((app.address, "data:", "blob:"))] == []
 
 
