@@ -124,7 +124,17 @@ def out_of_range():
         (RESTORE, "--memory-limit=1MB"),
         (RESTORE, "--bit-depth=20"),
         (RESTORE, "--sigma=-1"),
-        (RESTORE, "--sigma=nan"),
+        *((RESTORE, f"--sigma={value}") for value in ("nan", "inf", "60")),
+        (RESTORE, "--train=900"),
+        (RESTORE, "--frames=90:99"),
+        (RESTORE, "--roi=40,40,64,64"),
+        (RESTORE, "--bit-depth=7000"),
+        (RESTORE, "--flow.dis.smoothness=inf"),
+        (RESTORE, "--flow.dis.patch-stride=40"),
+        (RESTORE, "--flow.contrast-window=inf"),
+        (RESTORE, "--filter.image-noise=1e300"),
+        (RESTORE, "--filter.sharpness-window=nan"),
+        (RESTORE, "--dynamics.frames-per-state=inf"),
         (RESTORE, "--max-pixels=0"),
         (RESTORE, "--roi=-1,0,8,8"),
         ([*RESTORE, "--keep=kept"], "--checkpoint-every=0"),
@@ -159,11 +169,18 @@ def out_of_range():
 def contradicting():
     """Options that do not go together, words that are missing or too many."""
     yield Case([*RESTORE, "--sigma=1", "--deconvolution.sigma=2"], ("--sigma", "deconvolution.sigma"))
+    yield Case([*RESTORE, "--until=filter", "--sigma=1"], ("until = filter",))
+    yield Case([*RESTORE, "--until=filter", "--deconvolution.sigma=1"], ("until = filter",))
+    yield Case(["register", "a.mkv", "b.mkv", "--verbose"], ("Unknown option: --verbose.\n",))
+    yield Case(["steady", "a.mkv", "b.mkv", "--quiet", "--verbose"], ("--verbose: contradicts --quiet",))
+    yield Case(["restore", "-a.mkv", "b.png"], ("-a.mkv: taken for an option; write ./-a.mkv, or -- before the paths",))
+    yield Case(["--install-completion", "--shell", "fsh"], ('Did you mean "fish"?',))
+    yield Case(["config", "--init", "a.txt"], (".toml",))
     yield Case([*RESTORE, "--strict", "--skip-damaged"], ("--strict", "--skip-damaged"))
     yield Case([*RESTORE, "--resume"], ("--resume", "--keep"))
     yield Case([*RESTORE, "--report=r.txt"], ("r.txt", ".html"))
     yield Case([*RESTORE, "--frames"], ("--frames",))
-    yield Case([*RESTORE, "more.png"], ("more.png",))
+    yield Case([*RESTORE, "more.png"], ("more.png: one word too many",))
     yield Case(["restore", "clip.npy"], ("OUTPUT",))
     yield Case(["restore", "clip.npy", "o.gif"], ("o.gif", ".png"))
     yield Case(["centroid", "clip.npy", "c.zip"], ("c.zip", ".npz"))
@@ -230,6 +247,11 @@ def settings_files():
         ("memory_limit = '2 big'\n", ("memory_limit", "2GB")),
         ("memory_limit = true\n", ("memory_limit",)),
         ("train = 1\n", ("train",)),
+        ("qqq = 3\n", ("turbrestore config --init",)),
+        ("report = 'a.html'\n", ("report belongs on the command line",)),
+        ("sigma = 1e999\n", ("sigma: expected",)),
+        ("a = " + "[" * 100_000, ("run.toml: expected settings as TOML",)),
+        ("train = " + "9" * 6000, ("run.toml: expected settings as TOML",)),
         ("roi = '1,2,3'\n", ("--roi",)),
         ("frames = 'a:b'\n", ("--frames",)),
         ("bit_depth = 20\n", ("bit_depth",)),
