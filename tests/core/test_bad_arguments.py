@@ -106,6 +106,7 @@ def of_another_type():
         (EVALUATE, "--max-pixels=big"),
         (INFO, "--roi=left"),
         (WAVEFRONT, "--seeds=some"),
+        (WAVEFRONT, "--seeds=2.5"),
         (MIRROR, "--deviation=7dB"),
     ):
         yield Case([*words, option], (option.split("=")[0],))
@@ -159,7 +160,7 @@ def out_of_range():
         (SYNTHESIZE, "--frames=0"),
         (SYNTHESIZE, "--seed=-1"),
         (SYNTHESIZE, "--size=0x0"),
-        (WAVEFRONT, "--seeds=0"),
+        *((WAVEFRONT, option) for option in ("--seeds=0", "--seeds=1", "--slope-disturbance=0")),
         (WAVEFRONT, "--params.noise=-1"),
         (MIRROR, "--deviation=9"),
     ):
