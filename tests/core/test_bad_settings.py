@@ -21,18 +21,30 @@ from turbrestore.synthesis.smooth_flow import SmoothFlowParams
 NAN, INF = np.nan, np.inf
 # Values of a setting by its name, for each set of settings.
 WRONG = {
-    FlowParams: {"method": ["sift"], "contrast_window": [-1], "contrast_floor": [0]},
-    DisParams: {"patch_stride": [9], "finest_scale": [9]},
+    FlowParams: {"method": ["sift"], "contrast_window": [-1, INF], "contrast_floor": [0]},
+    DisParams: {"patch_size": [0], "patch_stride": [9, 40], "finest_scale": [9], "smoothness": [INF]},
     FarnebackParams: {"neighbourhood": [6]},
     TvL1Params: {
         **{name: [0] for name in ("attachment", "warps", "sweeps", "step", "levels", "batch")},
         **{"huber": [-1], "median": [2], "tolerance": [NAN]},
     },
     CentroidParams: {"mode": ["median"], "iterations": [0], "tolerance": [-1.0], "start": [-1]},
-    DynamicsParams: {"rank": [-1], "energy": [0.0, 1.1], "max_rank": [-1], "frames_per_state": [0.5], "ridge": [-0.1]},
+    DynamicsParams: {
+        "rank": [-1],
+        "energy": [0.0, 1.1],
+        "max_rank": [-1],
+        "frames_per_state": [0.5, INF],
+        "ridge": [-0.1],
+    },
     FilterParams: {
-        **{"residual": ["half"], "inner_iterations": [0], "block": [0], "sharpness": [-1.0], "sharpness_window": [0.0]},
-        **{"image_noise": [0.0], "image_drift": [-1.0], "prior_frames": [-1.0]},
+        **{
+            "residual": ["half"],
+            "inner_iterations": [0],
+            "block": [0],
+            "sharpness": [-1.0],
+            "sharpness_window": [0.0, NAN],
+        },
+        **{"image_noise": [0.0, 1e300], "image_drift": [-1.0], "prior_frames": [-1.0]},
     },
     DeconvolutionParams: {
         **{"method": ["magic"], "boundary": ["mirror"], "channels": ["red"], "sigma": [-1.0], "fidelity": [0.0, INF]},
