@@ -56,7 +56,7 @@ STATISTICS = [
 ]
 
 
-@pytest.mark.parametrize(("scene", "statistics"), zip(itertools.cycle(["chart", "camera"]), STATISTICS), ids=str)
+@pytest.mark.parametrize(("scene", "statistics"), [*zip(itertools.cycle(["chart", "camera"]), STATISTICS)], ids=str)
 def test_the_filter_never_ends_worse_than_the_centroid(scene, statistics):
     sequence = make_sequence(scene=scene, size=72, blur_change=1.0, **statistics)
     centroid, dynamics = start(sequence, len(sequence.frames) // 2)
@@ -64,7 +64,7 @@ def test_the_filter_never_ends_worse_than_the_centroid(scene, statistics):
     assert quality(filtered.image, sequence) >= quality(centroid.image, sequence)
 
 
-@pytest.mark.parametrize(("scene", "statistics"), zip(itertools.cycle(["camera", "chart"]), STATISTICS), ids=str)
+@pytest.mark.parametrize(("scene", "statistics"), [*zip(itertools.cycle(["camera", "chart"]), STATISTICS)], ids=str)
 def test_where_nothing_can_be_gained_less_than_two_grey_levels_are_lost(scene, statistics):
     """Equally sharp frames, registered almost perfectly: the centroid is within a grey level or two of the truth."""
     sequence = make_sequence(scene=scene, size=72, **statistics)
