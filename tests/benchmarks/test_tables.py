@@ -5,13 +5,20 @@ import sys
 import all as everything
 import blur_clips
 import clips
+import cv2
 import numpy as np
+import oracles
 import provenance
+import pytest
 import quality
+import quality_change
 import texts
+import words
 from provenance import LINE, outdated, revision, with_origin
 
 import turbrestore
+from turbrestore.io.images.image_files import read_image
+from turbrestore.registration.warp import warp
 
 
 class TestDrawnClips:
@@ -41,12 +48,39 @@ def test_reported_and_other_clips_have_means_of_their_own():
     assert "25.00" in reported and "smooth_cat" in reported and "40.00" in others
 
 
+def test_what_is_read_of_dithered_copies_does_not_depend_on_the_last_bits(monkeypatch):
+    monkeypatch.setitem(words.READERS, "bits", lambda path: [["word"] if read_image(path).image[32, 32] > 0.5 else []])
+    below, above = (np.full((24, 24), (127.5 + bit) / 255, np.float32) for bit in (-1e-3, 1e-3))
+    assert [words.share_read(image, ("word",), "bits") for image in (below, above)] == [0, 1]
+    one, other = (words.shares_read(image, ("word",), "bits") for image in (below, above))
+    np.testing.assert_array_equal(one, other)
+    assert 0 < one.mean() < 1
+
+
+def test_the_change_of_words_has_the_standard_error_of_its_mean():
+    shares = np.array([[0.5, 0.6, 0.7, 0.8], [0.6, 0.6, 0.8, 0.8]], np.float32)
+    row = quality_change._row("clip", quality_change.Change({}, shares, 1.0))
+    # Changes of 0.1, 0, 0.1 and 0: their deviation is 0.2 / √12, and that of their mean half of it.
+    assert row.endswith("| 0.650 | 0.700 | +0.050 ± 0.029 |")
+
+
 def test_a_table_says_what_it_is_of_once():
     once = with_origin("# Title\n\nText.\n")
     assert with_origin(once).count("turbrestore") == 1
     found = LINE.search(once)
     assert found["version"] == turbrestore.__version__ and found["revision"] == revision()
     assert LINE.sub("", once) == "# Title\n\nText.\n"
+
+
+def test_oracles_know_the_motion_and_the_blur():
+    case = oracles.Case(count=6, displacement=1.5, blur=1.2, noise=0.0)
+    frames, flows, truth, _ = oracles.clip("coins", case)
+    inside = np.s_[12:-12, 12:-12]
+    blurred = cv2.GaussianBlur(truth, (0, 0), case.blur)
+    registered = np.mean([warp(frame, flow) for frame, flow in zip(frames, flows, strict=True)], axis=0)
+    assert np.abs(registered - blurred)[inside].mean() < 0.2 * np.abs(frames[0] - blurred)[inside].mean()
+    assert np.abs(flows.mean(axis=0))[inside].max() < 0.1
+    assert oracles.blur_of(blurred, truth).sigma == pytest.approx(case.blur, rel=0.15)
 
 
 class TestOutdated:
