@@ -197,7 +197,7 @@ class Tab:
         return Path(self._own.name)
 
     def _next_film(self) -> Path:
-        """Return where the next film goes; the one that is shown stays until there is another, older ones are removed."""
+        """Return where the next film goes; the one that is shown stays, and older ones are removed."""
         shown = None if self.steadied is None else self.steadied.film_path
         for name, path in tuple(self.films.items()):
             if path != shown:
