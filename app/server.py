@@ -107,7 +107,7 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
     @app.get("/pictures/{key}/{name}", response_class=Response)
     def picture(key: str, name: str) -> Response:
         tab = _find(tabs, key)
-        data = tab and tab.pictures.get(name)
+        data = None if tab is None else tab.pictures.get(name)
         if data is None:
             return Response(status_code=404 if tab is None else 204)
         return Response(data, media_type="image/png", headers={"Cache-Control": "no-store"})
@@ -115,7 +115,7 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
     @app.get("/videos/{key}/{name}", response_class=Response)
     def video(key: str, name: str) -> Response:
         tab = _find(tabs, key)
-        film = tab and tab.films.get(name)
+        film = None if tab is None else tab.films.get(name)
         if film is None:
             return Response(status_code=404 if tab is None else 204)
         return FileResponse(film, media_type="video/mp4", headers={"Cache-Control": "no-store"})
