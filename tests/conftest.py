@@ -15,6 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis.strategies import none
 
 from turbrestore.core.arrays import luminance
+from turbrestore.footage.correction import Correction
 from turbrestore.footage.survey import Survey, take_survey
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
@@ -97,6 +98,13 @@ SCENES = {"chart": lambda size: resolution_chart(size, size), "camera": natural_
 
 def surveyed(frames) -> Survey:
     return take_survey(FrameSource.from_array(frames))
+
+
+def corrected(frames, find) -> tuple[FrameSource, Correction]:
+    """A clip without what a detector finds in it, and what that is."""
+    survey = surveyed(frames)
+    found = find(survey)
+    return survey.corrected(found).clip, found
 
 
 def make_sequence(

@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from conftest import SCENES, make_sequence, surveyed
+from conftest import SCENES, corrected, make_sequence, surveyed
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
-from turbrestore.footage.bars import without_bars
+from turbrestore.footage.bars import find_bars
 from turbrestore.footage.checks.content import check_content
-from turbrestore.footage.levels import stretch_levels
-from turbrestore.footage.lighting.light import steady_light
-from turbrestore.footage.overlays import Title, _titles, read_static_mask, without_overlay
+from turbrestore.footage.lighting.light import find_light
+from turbrestore.footage.lighting.range import find_range
+from turbrestore.footage.overlays import Title, _titles, find_overlay, find_title, read_static_mask
 from turbrestore.io.images.image_files import write_image
 from turbrestore.io.source import FrameSource
 from turbrestore.metrics import compare
@@ -77,22 +77,21 @@ class TestLight:
     def test_in_colour_with_drift(self, clip):
         colours = clip.frames[..., None] * np.float32([0.8, 0.6, 0.4])
         drifting = np.stack([np.roll(frame, k // 3, axis=1) for k, frame in enumerate(colours)])
-        source, (found,) = steady_light(surveyed(u8(drifting * (1 + 0.2 * np.sin(T / 4))[..., None])))
-        even = source.clip.read()
+        source, found = corrected(u8(drifting * (1 + 0.2 * np.sin(T / 4))[..., None]), find_light)
+        even = source.read()
         left = [np.roll(frame, -(k // 3), axis=1)[:, :66].mean() for k, frame in enumerate(even)]
-        assert found.subject == "light" and np.ptp(left) < 0.05 * np.mean(left)
+        assert found.decisions[0].subject == "light" and np.ptp(left) < 0.05 * np.mean(left)
 
     def test_rows_of_a_region_are_those_of_the_file(self, clip):
         bands = u8(0.8 * clip.frames * LIGHT["bands of the mains"][0])
-        whole, _ = steady_light(surveyed(bands))
-        part = whole.clip.select((3, 9), (5, 40, 20, 30))
-        np.testing.assert_array_equal(part.read(), whole.clip.read(3, 9)[:, 40:70, 5:25])
+        whole, _ = corrected(bands, find_light)
+        part = whole.select((3, 9), (5, 40, 20, 30))
+        np.testing.assert_array_equal(part.read(), whole.read(3, 9)[:, 40:70, 5:25])
 
     @pytest.mark.parametrize("scene", ["camera", "chart"])
     @pytest.mark.parametrize("rms", [0.5, 3.0])
     def test_steady_light_is_left_as_it_is(self, scene, rms):
-        survey = surveyed(make_sequence(5, 20, 96, scene, rms=rms).frames.clip(0, 1))
-        assert steady_light(survey) == (survey, ())
+        assert find_light(surveyed(make_sequence(5, 20, 96, scene, rms=rms).frames.clip(0, 1))) is None
 
 
 @pytest.fixture(scope="module")
@@ -128,14 +127,14 @@ class TestOverlays:
 
     def test_a_stop_may_cover_half_of_the_frame_and_not_nearly_all(self, shaken):
         y, x = np.mgrid[:112, :112]
-        for radius, count in ((45, 1), (25, 0)):
+        for radius, is_one in ((45, True), (25, False)):
             stop = np.clip(radius - np.hypot(x - 56, y - 56), 0, 1)
-            assert len(without_overlay(surveyed(np.rint(shaken * stop).astype(np.uint8)))[3]) == count, radius
+            assert (find_overlay(surveyed(np.rint(shaken * stop).astype(np.uint8))) is not None) == is_one, radius
 
     def test_thin_lines_alone(self, shaken):
         covered = shaken.copy()
         covered[:, 56, 36:76] = covered[:, 36:76, 56] = 255
-        read = without_overlay(surveyed(covered))[0].clip.read()
+        read = corrected(covered, find_overlay)[0].read()
         assert read[:, 56, 36:76].mean() < 0.9 and read[:, 36:76, 56].mean() < 0.9
 
     def test_what_a_camera_that_hardly_moves_shows_is_kept(self):
@@ -149,8 +148,7 @@ class TestOverlays:
             frames = noise + np.stack([scene[y : y + 64, x : x + 64] for x, y in corners])
             frames[:, 48:58, 6:40] = 0
             frames[:, 50:56, 8:38:3] = 1
-            (found,) = without_overlay(surveyed(u8(frames)))[3]
-            assert what in found.choice
+            assert what in find_overlay(surveyed(u8(frames))).decisions[0].choice
 
     def test_switched_off(self, shaken):
         covered = shaken.copy()
@@ -185,18 +183,16 @@ class TestOverlays:
 
     def test_scenes_have_none(self, shaken, clip):
         for frames in (shaken, u8(clip.frames), u8(0.2 + 0 * clip.frames[:1] + 0.3 * clip.frames)):
-            survey = surveyed(frames)
-            assert without_overlay(survey) == (survey, None, None, ())
+            assert find_overlay(surveyed(frames)) is None
 
     def test_edges_along_a_pan_are_no_overlay(self):
         """They move by no more than the air bends them."""
         wide = u8(make_sequence(3, 32, 144, "chart", blur=0.8, noise=0.008, rms=0.3).frames)
         panned = np.stack([frame[20:120, number : number + 100] for number, frame in enumerate(wide)])
-        survey = surveyed(panned)
-        assert without_overlay(survey) == (survey, None, None, ())
+        assert find_overlay(surveyed(panned)) is None
         # Beside an overlay they are left alone, too.
         panned[:, 40:60, 49:51] = panned[:, 49:51, 40:60] = 0
-        clip = without_overlay(surveyed(panned))[0].clip
+        clip, _ = corrected(panned, find_overlay)
         changed = np.abs(clip.read() - panned / np.float32(255)).max(axis=0) > 1e-3
         assert changed[42:58, 49:51].mean() > 0.9
         changed[28:72, 28:72] = False
@@ -205,9 +201,8 @@ class TestOverlays:
     def test_a_window_is_that_of_the_whole_frame(self, shaken):
         covered = shaken.copy()
         covered[:, 40:44, 20:60] = 255
-        survey = surveyed(covered)
-        assert without_overlay(survey, titles_only=True) == (survey, None, None, ())
-        source = without_overlay(survey)[0].clip
+        assert find_title(surveyed(covered)) is None
+        source, _ = corrected(covered, find_overlay)
         assert (source.read()[:, 41:43, 22:58] < 1).any()
         part = source.select((2, 5), (15, 30, 30, 25))
         np.testing.assert_array_equal(part.read(), source.read(2, 5)[:, 30:55, 15:45])
@@ -235,15 +230,15 @@ class TestTitles:
         assert np.sqrt(np.mean((found.image[rows] - alone.image[rows]) ** 2)) < 0.025
 
     def test_a_window_is_that_of_the_whole_frame_and_letters_are_no_stuck_pixels(self, titled):
-        _, hidden, title, _ = without_overlay(surveyed(titled))
-        assert title is not None and np.array_equal(hidden, title.mask)
+        title = find_title(surveyed(titled))
+        assert np.array_equal(find_overlay(surveyed(titled)).hidden, title.mask)
         np.testing.assert_allclose(title.put_back(np.zeros((20, 30)), 5, 55)[title.mask[55:75, 5:35]].max(), 1)
         assert len(check_content(FrameSource.from_array(titled)).stuck) == 0
 
     def test_three_frames_are_enough(self, clip, titled):
         plain = u8(0.8 * clip.frames)
-        found = [len(without_overlay(surveyed(some))[3]) for some in (plain[:2], plain[:3], titled[:3])]
-        assert found == [0, 0, 1]
+        found = [find_overlay(surveyed(some)) is not None for some in (plain[:2], plain[:3], titled[:3])]
+        assert found == [False, False, True]
 
     def test_the_mask_is_that_of_the_text(self, titled):
         rim, letters = np.zeros((2, 96, 96), np.uint8)
@@ -251,34 +246,34 @@ class TestTitles:
             cv2.putText(canvas, "GATE 7", (6, 82), cv2.FONT_HERSHEY_SIMPLEX, 0.5, 255, width)
         scene = 0.05 + 0.8 * make_sequence(17, COUNT, 96, "camera", blur=0.8, noise=0.008, rms=1.2).frames
         for frames in (titled, u8(np.where(rim == 255, letters == 255, scene))):
-            text, mask = frames.std(axis=0) == 0, without_overlay(surveyed(frames))[2].mask
+            text, mask = frames.std(axis=0) == 0, find_title(surveyed(frames)).mask
             assert mask[text].mean() > 0.95
             assert not mask[cv2.dilate(text.astype(np.uint8), np.ones((13, 13))) == 0].any()
 
     def test_where_little_moves_lines_are_found_and_nothing_else(self):
         frames = u8(0.05 + 0.8 * make_sequence(17, COUNT, 96, "chart", blur=0.8, noise=0.008, rms=0.4).frames)
-        assert without_overlay(surveyed(frames))[3] == ()
+        assert find_overlay(surveyed(frames)) is None
         frames[:, 48, 28:68] = frames[:, 28:68, 48] = 255
-        assert without_overlay(surveyed(frames))[2].mask[48, 28:68].mean() > 0.9
+        assert find_title(surveyed(frames)).mask[48, 28:68].mean() > 0.9
 
     def test_a_small_mark_that_a_coder_made_noisy_keeps_its_colour(self, clip):
         frames = np.repeat(u8(0.8 * clip.frames)[..., None], 3, axis=3)
         plain = frames.copy()
         noise = np.random.default_rng(0).normal(0, 6, (COUNT, 6, 6, 1))
         frames[:, :6, 50:56] = np.clip(np.array([230, 20, 20]) + noise, 0, 255)
-        title = without_overlay(surveyed(frames))[2]
+        title = find_title(surveyed(frames))
         assert title is not None and title.mask[:6, 50:56].all() and title.mask.sum() < 100
         found = restore(FrameSource.from_array(frames))
         np.testing.assert_allclose(found.image[:6, 50:56], found.mean[:6, 50:56], atol=0.01)
-        assert without_overlay(surveyed(plain))[2] is None
+        assert find_title(surveyed(plain)) is None
 
     def test_dark_lines_along_the_border_and_still_clips_have_none(self, clip, titled):
         lined = u8(0.8 * clip.frames)
         lined[:, :, -2:] = 20
-        assert without_overlay(surveyed(lined))[2] is None
+        assert find_title(surveyed(lined)) is None
         noise = np.random.default_rng(1).normal(0, 2, titled.shape)
         still = np.where(titled[0] == 255, 255, np.clip(titled[0] + noise, 0, 250)).astype(np.uint8)
-        assert without_overlay(surveyed(still))[2] is None
+        assert find_title(surveyed(still)) is None
 
     def test_dim_clips_of_16_bits_have_those_of_bright_ones(self, clip, titled, shaken, sequence):
         plain, marked = u8(0.8 * clip.frames), shaken.copy()
@@ -287,14 +282,14 @@ class TestTitles:
         between = np.random.default_rng(1).uniform(-0.5, 0.5, (COUNT, 112, 112))
         for name, bright in {"title": titled, "reticle": marked, "plain": plain, "shaken": shaken}.items():
             dim = u16(0.1 + 0.02 / 255 * (bright + between[:, : bright.shape[1], : bright.shape[2]]))
-            _, _, title, decisions = without_overlay(surveyed(dim))
-            assert (title is not None, len(decisions)) == (name == "title", name in ("title", "reticle")), name
+            title, overlay = find_title(surveyed(dim)), find_overlay(surveyed(dim))
+            assert (title is not None, overlay is not None) == (name == "title", name in ("title", "reticle")), name
             if title is not None:
-                assert (title.mask == without_overlay(surveyed(bright))[2].mask).mean() > 0.98
+                assert (title.mask == find_title(surveyed(bright)).mask).mean() > 0.98
         # Levels of 8 bits stay coarse in a file of 16.
         for steps in (2, 6, 8):
             coarse = 257 * np.rint(steps * sequence.frames.clip(0, 1)).astype(np.uint16)
-            assert without_overlay(surveyed(coarse))[3] == ()
+            assert find_overlay(surveyed(coarse)) is None
 
     def test_they_are_large_enough_and_the_scene_bends_enough(self):
         waves = np.arange(48) + np.zeros((12, 48, 1))
@@ -302,7 +297,7 @@ class TestTitles:
         for bending, side, found in ((0.2, 8, False), (0.4, 8, True), (0.8, 3, False), (0.8, 4, True)):
             frames = 0.5 + 0.3 * np.sin(np.pi / 6 * (waves + bending * turns))
             frames[:, 20 : 20 + side, 20 : 20 + side] = 1
-            assert (without_overlay(surveyed(u8(frames)))[2] is not None) == found, (bending, side)
+            assert (find_title(surveyed(u8(frames))) is not None) == found, (bending, side)
 
     def test_parts_stay_unless_half_of_their_edges_move_by_half_a_pixel(self):
         ramp, mask = np.tile(np.linspace(0, 1, 41, dtype=np.float32), (30, 1)), np.zeros((30, 41), bool)
@@ -330,7 +325,7 @@ class TestClocks:
         for number, frame in enumerate(frames):
             for shade, width in ((0, 3), (255, 1)):
                 cv2.putText(frame, f"1:{number // 2:02d}", (8, 70), cv2.FONT_HERSHEY_SIMPLEX, 0.5, shade, width)
-        title = without_overlay(surveyed(frames))[2]
+        title = find_title(surveyed(frames))
         changing = (frames.std(axis=0) > 40) & ((frames != plain).mean(axis=0) >= 0.5)
         assert title is not None and title.mask[changing].mean() > 0.9
         assert title.mask[:46].sum() == 0
@@ -342,7 +337,7 @@ class TestClocks:
         for number, frame in enumerate(frames):
             for shade, width in ((0, 3), (255, 1)):
                 cv2.putText(frame, f"1:{number // 2:02d}", (8, 98), cv2.FONT_HERSHEY_SIMPLEX, 0.5, shade, width)
-        read = 255 * without_overlay(surveyed(frames))[0].clip.read()
+        read = 255 * corrected(frames, find_overlay)[0].read()
         text = frames != shaken
         assert (np.abs(read - frames)[text] > 1).mean() > 0.95
         far = cv2.dilate(text.any(axis=0).astype(np.uint8), np.ones((13, 13))) == 0
@@ -365,15 +360,13 @@ class TestBars:
         np.testing.assert_allclose(255 * found.image[outside], 16, atol=0.01)
 
     def test_windows_are_those_of_the_whole_frame(self, clip):
-        source, _, _ = without_bars(surveyed(np.pad(u8(clip.frames), ((0, 0), (9, 9), (0, 0)))))
-        source = source.clip
+        source, _ = corrected(np.pad(u8(clip.frames), ((0, 0), (9, 9), (0, 0))), find_bars)
         np.testing.assert_array_equal(source.select((1, 3), (5, 0, 30, 25)).read(), source.read(1, 3)[:, :25, 5:35])
 
     def test_black_around_a_disc_is_no_bar(self):
         y, x = np.mgrid[:64, :80]
         disc = 0.8 * (np.hypot(x - 40, y - 32) < 20)
-        survey = surveyed(u8(np.stack([np.roll(disc, k, axis=1) for k in range(5)])))
-        assert without_bars(survey) == (survey, None, ())
+        assert find_bars(surveyed(u8(np.stack([np.roll(disc, k, axis=1) for k in range(5)])))) is None
 
 
 class TestRange:
@@ -408,16 +401,13 @@ class TestRange:
         y, x = np.mgrid[:64, :80]
         rng = np.random.default_rng(0)
         discs = [0.8 * (np.hypot(x - 40 - dx, y - 32 - dy) < 8) for dx, dy in rng.uniform(-20, 20, (20, 2))]
-        survey = surveyed(u8(np.stack(discs)))
-        assert stretch_levels(survey)[0] is survey
+        assert find_range(surveyed(u8(np.stack(discs)))) is None
 
     def test_wide_clips_are_left_as_they_are(self, clip):
-        survey = surveyed(u8(clip.frames))
-        same, levels, decisions = stretch_levels(survey)
-        assert same is survey and not levels.changed and decisions == ()
+        assert find_range(surveyed(u8(clip.frames))) is None
 
     @pytest.mark.parametrize("deviation", [0, 0.0002])
     def test_noise_is_no_scene(self, deviation):
         noise = 0.1 + deviation * np.random.default_rng(0).standard_normal((20, 48, 48))
         with pytest.raises(DataError, match="some contrast"):
-            stretch_levels(surveyed(noise.astype(np.float32)))
+            find_range(surveyed(noise.astype(np.float32)))

@@ -13,7 +13,7 @@ from .agreement.last_guard import Guarded, keep_agreed
 from .blind.structure import compare_structure
 from .blur.posterior import BlurPosterior, BlurWitnesses, measure_witnesses
 from .blur.witnesses.short_exposure import displacement_variance
-from .core.arrays import FloatArray, luminance
+from .core.arrays import ROUNDING, FloatArray, luminance
 from .core.decision import Decision
 from .core.noise import NoiseCurve, photon_noise
 from .core.noise_spectrum import NoiseSpectrum
@@ -84,7 +84,7 @@ def evidence_of_frames(
 def fused_noise(filtered: Filtered, halves: HalvedClip) -> NoiseSpectrum:
     """Noise of the filtered image: that of the mean of the training frames, for as many frames as its weights leave."""
     # Σ / Z₀ is one over the number of frames that count.  A border that few of them show is no usual pixel.
-    counting = filtered.image_noise / max(float(np.median(filtered.variance)), 1e-12)
+    counting = filtered.image_noise / max(float(np.median(filtered.variance)), ROUNDING**2)
     return halves.noise.scaled(halves.count / counting * filtered.noise_gain)
 
 

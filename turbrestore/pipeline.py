@@ -26,7 +26,7 @@ from .io.images.image_files import read_image
 from .io.output import check_space
 from .io.source import FrameSource
 from .memory_plan import plan_memory
-from .preparation import prepare, undo_preparation
+from .preparation import prepare
 from .registration.centroid import Centroid
 from .registration.coverage import Rectangle, coverage, well_seen
 from .registration.flow import MIN_SIDE
@@ -146,7 +146,7 @@ def restore(
         restoration = _deblur_and_crop(run, *_fuse(run), psf)
     if params.scale > 1:
         restoration = _add_finer_grid(run, restoration)
-    return undo_preparation(restoration, prepared)
+    return prepared.undo(restoration)
 
 
 def _fuse(run: Run) -> tuple[Restoration, Evidence]:

@@ -2,28 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .core.arrays import FloatArray
 from .core.decision import Decision
 from .core.remarks import Doubt
 from .core.verdict import CheckKind
-from .footage.background import without_moving_objects
-from .footage.bars import Bars, without_bars
+from .footage.background import find_moving_objects
+from .footage.bars import find_bars
 from .footage.checks.two_states import find_two_states
-from .footage.levels import Levels, stretch_levels
-from .footage.lighting.light import steady_light
-from .footage.lighting.white_balance import steady_white_balance
-from .footage.overlays import Title, read_static_mask, without_overlay
-from .footage.pixel_pattern import without_pixel_pattern
-from .footage.sensor_pattern import without_stripes
-from .footage.survey import measure_moments, take_survey
+from .footage.correction import Correction, PutBack
+from .footage.levels import Levels
+from .footage.lighting.light import find_light
+from .footage.lighting.range import find_range
+from .footage.lighting.white_balance import find_white_balance
+from .footage.overlays import find_overlay, read_static_mask
+from .footage.pixel_pattern import find_pixel_pattern
+from .footage.sensor_pattern import find_stripes
+from .footage.survey import Survey, take_survey
 from .io.source import FrameSource, Window
 from .results import Restoration, at_levels_of_clip
+
+Find = Callable[[Survey], Correction | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,69 +38,81 @@ class Prepared:
     """Frames as the stages take them, and what was changed."""
 
     source: FrameSource
-    levels: Levels  # from the levels of the clip to those of the stages
-    bars: Bars | None
+    corrections: tuple[Correction, ...] = ()  # in the order in which they act
     # (H, W): pixels of the scene that no frame shows, because an overlay covers them or the file lacks them.
-    hidden: NDArray[np.bool_] | None
-    title: Title | None  # overlay that is put back into results
-    decisions: tuple[Decision, ...]
-    objects_replaced: bool = False
+    hidden: NDArray[np.bool_] | None = None
+    decisions: tuple[Decision, ...] = ()
+
+    @property
+    def levels(self) -> Levels:
+        """From the levels of the clip to those of the stages."""
+        return next((each.levels for each in self.corrections if each.levels is not None), Levels())
 
     @property
     def picture(self) -> Window:
         """Rows and columns between the bars."""
-        return np.s_[:, :] if self.bars is None else self.bars.picture
+        return next((each.picture for each in self.corrections if each.picture is not None), np.s_[:, :])
+
+    def put_back(self, image: FloatArray) -> FloatArray:
+        """Put what is no scene back into an image (H, W[, 3]) at the levels of the clip."""
+        for put_back in self._to_put_back():
+            image = put_back(image)
+        return image
+
+    def undo(self, restoration: Restoration) -> Restoration:
+        """Bring a restoration back to the levels of the clip, and put what is no scene back."""
+        objects_replaced = any(each.replaces_objects for each in self.corrections)
+        restoration = replace(restoration, objects_replaced=objects_replaced)
+        if self.levels.changed:
+            restoration = _at_levels_of_clip(restoration, self.levels)
+        for put_back in self._to_put_back():
+            restoration = _put_back(restoration, put_back)
+        return restoration
+
+    def _to_put_back(self) -> Iterator[PutBack]:
+        return (each.put_back for each in reversed(self.corrections) if each.put_back is not None)
 
 
 def prepare(source: FrameSource, static_mask: str = "auto", scratch: Path | None = None) -> Prepared:
     """Prepare the frames of a clip, which are read once, and once more if there are moving objects."""
-    mask = None if static_mask in ("auto", "off") else read_static_mask(static_mask, source)
-    survey = take_survey(source, scratch)
-    # Bars first: a dark field stop would be mistaken for bands of flicker.
-    survey, bars, bar_decisions = without_bars(survey)
-    moments = measure_moments(survey)
-    # Stripes before overlays: a dead column is static and would be taken for an overlay.
-    survey, stripe_decisions = without_stripes(survey, moments)
-    moments = measure_moments(survey) if stripe_decisions else moments
-    survey, pattern_decisions = without_pixel_pattern(survey, moments)
-    hidden, title, overlay_decisions = None, None, tuple[Decision, ...]()
-    if static_mask != "off":
-        survey, hidden, title, overlay_decisions = without_overlay(survey, mask, None if pattern_decisions else moments)
+    finds, survey, corrections = _detectors(static_mask, source), take_survey(source, scratch), list[Correction]()
+    for find in finds:
+        correction = find(survey)
+        if correction is not None:
+            survey = survey.corrected(correction)
+            # The reduced frames are not needed any more.
+            corrections.append(replace(correction, small=None))
+    hidden = [each.hidden for each in corrections if each.hidden is not None]
     if source.unseen is not None:
-        unseen = source.unseen[source.window]
-        hidden = unseen if hidden is None else hidden | unseen
-    survey, colour_decisions = steady_white_balance(survey)
-    survey, light_decisions = steady_light(survey)
-    state_decisions = find_two_states(survey)
-    survey, levels, range_decisions = stretch_levels(survey)
-    clip, object_decisions = without_moving_objects(survey) if static_mask != "off" else (survey.clip, ())
-    decisions = (
-        *(
-            Decision("input", "to be checked", found, CheckKind.INPUT)
-            for found in source.warnings
-            if isinstance(found, Doubt)
-        ),
-        *bar_decisions,
-        *stripe_decisions,
-        *pattern_decisions,
-        *overlay_decisions,
-        *colour_decisions,
-        *light_decisions,
-        *state_decisions,
-        *range_decisions,
-        *object_decisions,
-    )
-    return Prepared(clip, levels, bars, hidden, title, decisions, bool(object_decisions))
+        hidden.append(source.unseen[source.window])
+    decisions = [
+        Decision("input", "to be checked", found, CheckKind.INPUT)
+        for found in source.warnings
+        if isinstance(found, Doubt)
+    ]
+    for correction in corrections:
+        decisions += correction.decisions
+    nowhere = np.logical_or.reduce(hidden) if hidden else None
+    return Prepared(survey.clip, tuple(corrections), nowhere, tuple(decisions))
 
 
-def undo_preparation(restoration: Restoration, prepared: Prepared) -> Restoration:
-    """Bring a restoration of prepared frames back to the levels of the clip, and put title and bars back."""
-    restoration = replace(restoration, objects_replaced=prepared.objects_replaced)
-    if prepared.levels.changed:
-        restoration = _at_levels_of_clip(restoration, prepared.levels)
-    for part in (prepared.title, prepared.bars):
-        restoration = restoration if part is None else _put_back(restoration, part)
-    return restoration
+def _detectors(static_mask: str, source: FrameSource) -> list[Find]:
+    """List what is looked for, in this order."""
+    mask = None if static_mask in ("auto", "off") else read_static_mask(static_mask, source)
+    with_overlays = static_mask != "off"
+    return [
+        # Bars first: a dark field stop would be mistaken for bands of flicker.
+        find_bars,
+        # Stripes before overlays: a dead column is static and would be taken for an overlay.
+        find_stripes,
+        find_pixel_pattern,
+        *([partial(find_overlay, mask=mask)] if with_overlays else ()),
+        find_white_balance,
+        find_light,
+        find_two_states,
+        find_range,
+        *([find_moving_objects] if with_overlays else ()),
+    ]
 
 
 def _at_levels_of_clip(restoration: Restoration, levels: Levels) -> Restoration:
@@ -112,16 +131,16 @@ def _at_levels_of_clip(restoration: Restoration, levels: Levels) -> Restoration:
     )
 
 
-def _put_back(restoration: Restoration, part: Bars | Title) -> Restoration:
+def _put_back(restoration: Restoration, put_back: PutBack) -> Restoration:
     """Put what is no scene back into the images of a restoration."""
     corner, finer, uncertainty = restoration.crop[:2], restoration.finer, restoration.uncertainty
-    image = part.put_back(restoration.image, *corner)
+    image = put_back(restoration.image, *corner)
     if finer is not None:
         size = finer.shape[1::-1]
         covered = cv2.resize((image != restoration.image).astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
         finer = np.where(covered > 0.5, cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), finer)
     if uncertainty is not None:
-        covered = np.atleast_3d(part.put_back(np.full_like(restoration.image, -1), *corner))[..., 0] >= 0
+        covered = np.atleast_3d(put_back(np.full_like(restoration.image, -1), *corner))[..., 0] >= 0
         # Pixels under it were never observed.
         uncertainty = np.where(covered, np.float32(np.inf), uncertainty)
-    return replace(restoration, image=image, mean=part.put_back(restoration.mean), uncertainty=uncertainty, finer=finer)
+    return replace(restoration, image=image, mean=put_back(restoration.mean), uncertainty=uncertainty, finer=finer)

@@ -14,7 +14,7 @@ from .blind.guards import GuardReading
 from .blind.structure import StructureReading
 from .blur.estimation import BlurEstimate
 from .blur.posterior import BlurPosterior
-from .core.arrays import FloatArray, luminance
+from .core.arrays import ROUNDING, FloatArray, luminance
 from .core.decision import Decision
 from .core.gradient import sobel_gradient
 from .core.noise_spectrum import NoiseSpectrum
@@ -278,7 +278,7 @@ def _share_of_air(flows: FloatArray) -> float:
     """Share of the motion, flows (T, H, W, 2), that is no shift of whole frames."""
     some = flows[:, ::4, ::4] - flows[:, ::4, ::4].mean(axis=0)
     shifts = np.median(some, axis=(1, 2), keepdims=True)
-    return float(np.linalg.norm(some - shifts) / max(float(np.linalg.norm(some)), 1e-9))
+    return float(np.linalg.norm(some - shifts) / max(float(np.linalg.norm(some)), ROUNDING))
 
 
 def _disputed(restoration: Restoration) -> float:
@@ -288,4 +288,4 @@ def _disputed(restoration: Restoration) -> float:
         return 0.0
     x, y, width, height = restoration.crop
     detail = np.hypot(*sobel_gradient(luminance(restoration.mean[y : y + height, x : x + width]))) ** 2
-    return float((share * detail).sum() / max(float(detail.sum()), 1e-12))
+    return float((share * detail).sum() / max(float(detail.sum()), ROUNDING**2))

@@ -16,7 +16,7 @@ def test_the_scale_is_the_deviation_of_normal_numbers_and_ignores_outliers():
 
 
 def test_weights_fall_from_one_to_zero():
-    weights = bisquare_weights(np.array([0.0, 1.0, -1.0, 5.0, 100.0]), 1.0, 1e-9)
+    weights = bisquare_weights(np.array([0.0, 1.0, -1.0, 5.0, 100.0]), 1.0)
     assert weights[0] == 1 and weights[1] == weights[2] == pytest.approx((1 - 1 / 4.685**2) ** 2)
     assert not weights[3:].any()
-    assert bisquare_weights(np.zeros(2), 0.0, 1e-9).tolist() == [1, 1]
+    assert bisquare_weights(np.zeros(2), 0.0).tolist() == [1, 1]

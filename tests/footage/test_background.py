@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from conftest import photograph, surveyed
-from turbrestore.footage.background import without_moving_objects
+from conftest import corrected, photograph, surveyed
+from turbrestore.footage.background import find_moving_objects
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
 from turbrestore.settings import RestoreParams
@@ -42,7 +42,7 @@ def test_frames_show_the_background_behind_moving_objects(channels):
     frames, empty = clip("brick", 3)
     if channels == 3:
         frames, empty = (some[..., None] * np.float32([1.0, 0.8, 0.6]) for some in (frames, empty))
-    cleaned, (decision,) = without_moving_objects(surveyed(frames))
+    cleaned, found = corrected(frames, find_moving_objects)
     cleaned = cleaned.read()
     covered = np.abs(frames - empty).reshape(*empty.shape[:3], -1).max(axis=3) > 0.1
     assert covered.mean() > 0.03
@@ -50,7 +50,7 @@ def test_frames_show_the_background_behind_moving_objects(channels):
     assert after < 0.4 * before
     far = cv2.dilate(covered.any(axis=0).astype(np.uint8), np.ones((21, 21))) == 0
     assert np.array_equal(cleaned[:, far], frames[:, far])
-    assert decision.subject == "moving objects"
+    assert found.decisions[0].subject == "moving objects"
 
 
 def test_the_image_is_that_of_the_clip_without_objects():
@@ -62,51 +62,49 @@ def test_the_image_is_that_of_the_clip_without_objects():
 
 
 def test_a_window_of_a_frame_is_cleaned_as_the_whole_frame_is():
-    cleaned, _ = without_moving_objects(surveyed(clip("brick", 3)[0]))
+    cleaned, _ = corrected(clip("brick", 3)[0], find_moving_objects)
     whole, part = cleaned.read(), cleaned.select(roi=(20, 10, 90, 100)).read()
     assert np.array_equal(whole[:, 10:110, 20:110], part)
 
 
 @pytest.mark.parametrize("scene", ["chart", "brick"])
 def test_turbulence_is_no_moving_object(scene):
-    survey = surveyed(clip(scene, d_over_r0=5.0)[1])
-    assert without_moving_objects(survey) == (survey.clip, ())
+    assert find_moving_objects(surveyed(clip(scene, d_over_r0=5.0)[1])) is None
 
 
 @pytest.mark.parametrize("scene", ["coffee", "page"])
 def test_frames_that_are_bent_by_many_pixels_hold_no_moving_objects(scene):
     rng = np.random.default_rng(1)
     moved = smooth_flows(25, 160, 160, rng, SmoothFlowParams(rms=4.0))
-    survey = surveyed(distort(photograph(scene, 160), moved, rng, blur=1.2, noise=0.01))
-    assert without_moving_objects(survey) == (survey.clip, ())
+    assert find_moving_objects(surveyed(distort(photograph(scene, 160), moved, rng, blur=1.2, noise=0.01))) is None
 
 
 def test_a_planet_that_drifts_is_the_scene():
     y, x = np.mgrid[:96, :160]
     frames = np.float32([0.8 * (np.hypot(x - 30 - 4 * k, y - 48) < 20) for k in range(25)])
     frames += 0.05 * (np.random.default_rng(0).random((96, 160)) > 0.998)  # Stars, which the planet covers.
-    survey = surveyed(cv2.GaussianBlur(frames.transpose(1, 2, 0), (0, 0), 1.5).transpose(2, 0, 1))
-    assert without_moving_objects(survey) == (survey.clip, ())
+    assert (
+        find_moving_objects(surveyed(cv2.GaussianBlur(frames.transpose(1, 2, 0), (0, 0), 1.5).transpose(2, 0, 1)))
+        is None
+    )
 
 
 def test_the_scene_is_no_moving_object_while_the_camera_moves():
     scene = SCENES["camera"](160, 240)
-    survey = surveyed(np.stack([scene[:, 4 * k : 4 * k + 140] for k in range(25)]))
-    assert without_moving_objects(survey) == (survey.clip, ())
+    assert find_moving_objects(surveyed(np.stack([scene[:, 4 * k : 4 * k + 140] for k in range(25)]))) is None
 
 
 def test_a_black_frame_is_left_as_it_is():
     frames, empty = (some.copy() for some in clip("brick", 3))
     frames[[5, 20]] = 0
-    cleaned, _ = without_moving_objects(surveyed(frames))
+    cleaned, _ = corrected(frames, find_moving_objects)
     assert not cleaned.read()[[5, 20]].any()
     empty[5] = 0
-    assert without_moving_objects(surveyed(empty))[1] == ()
+    assert find_moving_objects(surveyed(empty)) is None
 
 
 def test_few_frames_tell_nothing():
-    survey = surveyed(clip("brick", 3)[0][:8])
-    assert without_moving_objects(survey) == (survey.clip, ())
+    assert find_moving_objects(surveyed(clip("brick", 3)[0][:8])) is None
 
 
 def snowy(frames, share, seed=3):
@@ -123,10 +121,10 @@ def snowy(frames, share, seed=3):
 def test_snow_is_replaced_by_the_background():
     empty = 0.8 * clip("camera")[1]
     frames, covers = snowy(empty, 0.06)
-    cleaned, (decision,) = without_moving_objects(surveyed(frames))
+    cleaned, found = corrected(frames, find_moving_objects)
     before, after = (np.abs(some - empty)[covers > 0.3].mean() for some in (frames, cleaned.read()))
     assert after < 0.25 * before
-    assert "snow" in decision.reason
+    assert "snow" in found.decisions[0].reason
     found, median = restore(frames).image, np.median(frames, axis=0)
     assert (
         compare(found, 0.8 * SCENES["camera"](SIDE, SIDE)).psnr
@@ -143,8 +141,8 @@ def test_a_car_is_replaced_while_the_camera_moves():
     frames = empty.copy()
     for k, frame in enumerate(frames):
         frame[90:120, 6 * k - 50 : 6 * k] = 0.95 if 50 <= 6 * k <= 160 else frame[90:120, 6 * k - 50 : 6 * k]
-    cleaned, (decision,) = without_moving_objects(surveyed(frames))
+    cleaned, found = corrected(frames, find_moving_objects)
     covered = np.abs(frames - empty) > 0.1
-    assert covered.any() and decision.subject == "moving objects"
+    assert covered.any() and found.decisions[0].subject == "moving objects"
     before, after = (np.sqrt(np.mean((some - empty)[covered] ** 2)) for some in (frames, cleaned.read()))
     assert after < 0.3 * before

@@ -6,7 +6,7 @@ import pytest
 
 from conftest import photograph, surveyed
 from turbrestore.core.verdict import CheckKind
-from turbrestore.footage.overlays import without_overlay
+from turbrestore.footage.overlays import find_overlay
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
 SIDE, MARGIN = 160, 24
@@ -28,10 +28,9 @@ def clip_behind_words(opacity: float, shake: float) -> np.ndarray:
 
 @pytest.mark.parametrize("shake", [0, 2, 4])
 def test_a_watermark_is_named_and_left_in_the_frames_where_the_camera_moves(shake):
-    survey = surveyed(clip_behind_words(0.35, shake))
-    after, hidden, title, decisions = without_overlay(survey)
-    assert [decision.check for decision in decisions] == [CheckKind.WATERMARK] and hidden is None
-    assert (title is None) == (after is survey) == (shake > 0)
+    found = find_overlay(surveyed(clip_behind_words(0.35, shake)))
+    assert [decision.check for decision in found.decisions] == [CheckKind.WATERMARK] and found.hidden is None
+    assert (found.put_back is None) == (found.apply is None) == (shake > 0)
 
 
 @pytest.mark.parametrize("level", [20, 255])
@@ -44,15 +43,16 @@ def test_what_is_opaque_is_replaced_while_the_camera_moves(level):
         frames[:, stop] = np.random.default_rng(0).normal(level, 2, frames[:, stop].shape).round()
     else:
         frames[:, 90:110, 40:120] = level
-    _, hidden, title, decisions = without_overlay(surveyed(frames))
-    assert title is None and hidden is not None and [decision.check for decision in decisions] == [None]
+    found = find_overlay(surveyed(frames))
+    assert found.put_back is None and found.hidden is not None
+    assert [decision.check for decision in found.decisions] == [None]
 
 
 def test_an_opaque_title_is_kept_without_a_doubt():
-    _, hidden, title, decisions = without_overlay(surveyed(clip_behind_words(1.0, 0)))
-    assert title is not None and hidden is not None and [decision.check for decision in decisions] == [None]
+    found = find_overlay(surveyed(clip_behind_words(1.0, 0)))
+    assert found.put_back is not None and found.hidden is not None
+    assert [decision.check for decision in found.decisions] == [None]
 
 
 def test_a_clip_without_words_is_returned_as_it_is():
-    survey = surveyed(clip_behind_words(0.0, 0))
-    assert without_overlay(survey) == (survey, None, None, ())
+    assert find_overlay(surveyed(clip_behind_words(0.0, 0))) is None

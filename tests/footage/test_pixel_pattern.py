@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from conftest import make_sequence, surveyed
-from turbrestore.footage.pixel_pattern import _white_part, without_pixel_pattern
-from turbrestore.footage.survey import measure_moments
+from conftest import corrected, make_sequence, surveyed
+from turbrestore.footage.pixel_pattern import _white_part, find_pixel_pattern
 
 SIDE, COUNT = 128, 24
 
@@ -20,24 +19,23 @@ def pattern(seed, *shape):
 
 
 def cleaned(frames):
-    survey = surveyed(np.float32(frames))
-    return without_pixel_pattern(survey, measure_moments(survey))
+    return corrected(np.float32(frames), find_pixel_pattern)
 
 
 def left(found, frames, offsets):
     """What is left of offsets, as a share of them."""
-    return np.std((found.clip.read() - frames).mean(axis=0)) / np.std(offsets)
+    return np.std((found.read() - frames).mean(axis=0)) / np.std(offsets)
 
 
 @pytest.mark.parametrize("colours", [1, 3])
 def test_a_pattern_of_single_pixels_is_subtracted(frames, colours):
     still = np.squeeze(np.repeat(frames[..., None], colours, axis=3))
     offsets = pattern(1) if colours == 1 else pattern(1, 3)
-    found, (decision,) = cleaned(still + offsets)
+    found, correction = cleaned(still + offsets)
     assert left(found, still, offsets) < 0.35
-    assert decision.choice == "offsets of single pixels subtracted: 1.4 % of full scale"
-    part = found.clip.select(roi=(30, 50, 20, 10)).read()
-    np.testing.assert_allclose(part, found.clip.read()[:, 50:60, 30:50], atol=1e-6)
+    assert correction.decisions[0].choice == "offsets of single pixels subtracted: 1.4 % of full scale"
+    part = found.select(roi=(30, 50, 20, 10)).read()
+    np.testing.assert_allclose(part, found.read()[:, 50:60, 30:50], atol=1e-6)
 
 
 def test_a_pattern_that_changes_is_subtracted_from_the_frames_that_have_it(frames):
@@ -45,10 +43,10 @@ def test_a_pattern_that_changes_is_subtracted_from_the_frames_that_have_it(frame
     many = np.tile(frames, (8, 1, 1))
     for first in (69, 70, 71, 72):
         offsets = np.where(np.arange(len(many))[:, None, None] < first, pattern(1), pattern(2))
-        found, (decision,) = cleaned(many + offsets)
-        assert f"change at frame {first}," in decision.choice
+        found, correction = cleaned(many + offsets)
+        assert f"change at frame {first}," in correction.decisions[0].choice
     for part in (slice(0, first), slice(first, None)):
-        assert np.std((found.clip.read() - many)[part].mean(axis=0)) < 0.35 * 0.015
+        assert np.std((found.read() - many)[part].mean(axis=0)) < 0.35 * 0.015
 
 
 @pytest.mark.parametrize(("count", "left_of_noise"), [(1, 0.7), (30, 1.1)])
@@ -61,15 +59,13 @@ def test_little_of_the_noise_of_few_frames_is_taken_for_a_pattern(count, left_of
 
 
 def test_frames_without_a_pattern_are_left(frames):
-    survey = surveyed(frames)
-    assert without_pixel_pattern(survey, measure_moments(survey)) == (survey, ())
+    assert find_pixel_pattern(surveyed(frames)) is None
     # Noise that renews itself is no pattern, and neither is a texture that moves with the scene, or a still clip.
     noise = 0.015 * np.random.default_rng(1).standard_normal(frames.shape)
     moving = make_sequence(4, COUNT, SIDE, "chart", blur=0.5, noise=0.005, rms=0.6).frames
     still = np.repeat(frames[:1] + pattern(1), COUNT, axis=0) + 0.1 * noise
     for some in (frames + noise, moving, still, frames[:4] + pattern(1), frames + 0.15 * pattern(1)):
-        survey = surveyed(np.float32(some))
-        assert without_pixel_pattern(survey, measure_moments(survey)) == (survey, ())
+        assert find_pixel_pattern(surveyed(np.float32(some))) is None
 
 
 def test_a_part_where_nothing_moves_keeps_its_detail(frames):
@@ -78,7 +74,7 @@ def test_a_part_where_nothing_moves_keeps_its_detail(frames):
     wall = some[0, :, : SIDE // 3]
     some[:, :, : SIDE // 3] = wall + 0.004 * np.random.default_rng(0).standard_normal((COUNT, *wall.shape))
     found, _ = cleaned(some)
-    change = (found.clip.read() - some).mean(axis=0)
+    change = (found.read() - some).mean(axis=0)
     assert np.std(change[:, : SIDE // 8]) < 0.1 * np.std(offsets)
     assert np.std(change[:, -SIDE // 3 :] + offsets[:, -SIDE // 3 :]) < 0.4 * np.std(offsets)
 

@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
-from conftest import make_sequence, surveyed
-from turbrestore.footage.lighting.light import steady_light
+from conftest import corrected, make_sequence, surveyed
+from turbrestore.footage.lighting.light import find_light
 
 COUNT, SIDE = 24, 128
 
@@ -23,9 +23,8 @@ def shadow():
 
 def test_a_shadow_is_taken_out_in_windows_as_in_whole_frames():
     frames, gain = clip(), shadow()
-    source, decisions = steady_light(surveyed(frames * gain))
-    assert "light that changes in place evened out" in [decision.choice for decision in decisions]
-    source = source.clip
+    source, found = corrected(frames * gain, find_light)
+    assert "light that changes in place evened out" in [decision.choice for decision in found.decisions]
     left = source.read()
     change = np.log(cv2.blur(left.mean(axis=2).T, (1, 9)) / cv2.blur(frames.mean(axis=2).T, (1, 9)))
     assert change.std() < 0.2 * np.log(gain.mean(axis=2)).std()
@@ -42,4 +41,5 @@ def test_air_walkers_and_moving_cameras_are_no_light():
         frame[50:90, 5 * number : 5 * number + 14] = 0.05
     moved = np.stack([np.roll(frame, 4 * number, axis=1) for number, frame in enumerate(frames)])
     for some in (frames, walked, moved[:, :, 92:]):
-        assert not any("in place" in decision.choice for decision in steady_light(surveyed(some))[1])
+        found = find_light(surveyed(some))
+        assert found is None or not any("in place" in decision.choice for decision in found.decisions)

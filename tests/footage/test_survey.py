@@ -7,6 +7,7 @@ import pytest
 
 from conftest import make_sequence, surveyed
 from turbrestore.core.robust import spread
+from turbrestore.footage.correction import Correction
 from turbrestore.footage.survey import survey_memory, survey_scratch_bytes, take_survey
 from turbrestore.io.source import FrameSource
 from turbrestore.pipeline import restore
@@ -41,7 +42,7 @@ def test_whole_frames_are_those_of_the_clip(tmp_path, scratch):
         for number, frame in zip(survey.numbers, survey, strict=True):
             np.testing.assert_allclose(frame, clip.read(number - 3, number - 2)[0], rtol=1e-6)
         assert spread(len(survey.numbers), 5) == [0, 12, 24, 35, 47]
-        doubled = survey.adjusted(lambda _, values, window: 2 * values)
+        doubled = survey.corrected(Correction((), lambda _, values, window: 2 * values))
         np.testing.assert_allclose(next(iter(doubled)), 2 * next(iter(survey)))
     assert not list(tmp_path.iterdir())
 

@@ -9,8 +9,7 @@ import pytest
 import scipy
 
 import turbrestore
-from turbrestore.footage.bars import Bars
-from turbrestore.footage.levels import Levels
+from turbrestore.footage.correction import Correction
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
 from turbrestore.preparation import Prepared
@@ -160,7 +159,7 @@ def test_bars_do_not_count(clip):
     found, alone = (turbrestore.restore(frames, params).seeing.displacement_variance for frames in (barred, clip[0]))
     assert found.value == pytest.approx(alone.value, rel=0.1)
     frames = np.pad(clip[0], ((0, 0), (24, 24), (0, 0)), mode="symmetric")
-    prepared = Prepared(FrameSource.from_array(frames), Levels(), Bars(np.s_[24:-24, :], barred[0]), None, None, ())
+    prepared = Prepared(FrameSource.from_array(frames), (Correction((), picture=np.s_[24:-24, :]),))
     flows = np.pad(clip[1].flows, ((0, 0), (24, 24), (0, 0), (0, 0)), constant_values=3.0)
     image = np.pad(clip[1].image, ((24, 24), (0, 0)), mode="symmetric")
     within = seeing_of_picture(prepared.picture, frames, replace(clip[1], image=image, flows=flows))

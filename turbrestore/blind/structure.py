@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, luminance
+from ..core.arrays import ROUNDING, FloatArray, luminance
 from ..core.gradient import sobel_gradient
 from ..core.noise import estimate_noise
 from ..core.robust import spread
@@ -92,16 +92,16 @@ def compare_structure(
     totals = np.zeros(5)
     for window in _windows(edges.shape):
         direction = np.stack([derivative[window] for derivative in gradient])
-        direction /= np.maximum(steepness[window], np.float32(1e-12))
+        direction /= np.maximum(steepness[window], np.float32(ROUNDING))
         pairs = (_registered(frames[number], flows[number], window) for number in picked)
         totals += _compare_window(pairs, direction, edges[window])
         drop_pages(frames)
         drop_pages(flows)
     shown, unseen, registered, plain, pixels = totals
     variances = np.maximum(np.array([registered, plain]) / max(pixels, 1) - noise, 0)
-    left = float(min(variances[0] / max(variances[1], 1e-12), 1.0))
+    left = float(min(variances[0] / max(variances[1], ROUNDING**2), 1.0))
     return StructureReading(
-        float(unseen / max(shown, 1)), left, float(lasting / max(registered / max(pixels, 1), 1e-12))
+        float(unseen / max(shown, 1)), left, float(lasting / max(registered / max(pixels, 1), ROUNDING**2))
     )
 
 

@@ -26,6 +26,8 @@ from .remarks import counted
 FloatArray = NDArray[np.float32]
 
 CHANNELS = (3,)
+# Rounding error of float32 at full scale: intensities that differ by less are the same.
+ROUNDING = float(np.finfo(np.float32).eps)
 # Numbers in each part of a large array that is processed in parts.
 _PART = 1 << 22
 # Weights of RGB by Rec. 601, as OpenCV and most cameras use them.

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arrays import FloatArray, check_grey
+from .arrays import ROUNDING, FloatArray, check_grey
 
 # Rows that are filtered at once, and pixels that tell the noise to a quarter of a percent.
 _NOISE_ROWS, _NOISE_PIXELS = 16, 1 << 18
@@ -50,7 +50,7 @@ def fit_noise_curve(level: FloatArray, variance: FloatArray, energy: FloatArray)
     count = int(np.clip(levels.size // _PIXELS, 1, _LEVELS))
     low, high = np.percentile(levels, (1, 99))
     # Of equal width, because a dark sky would else take all of them.
-    edges = np.linspace(low, max(high, low + 1e-9), count + 1)
+    edges = np.linspace(low, max(high, low + ROUNDING), count + 1)
     numbers = np.clip(np.searchsorted(edges, levels) - 1, 0, count - 1)
     groups = []
     for number in range(count):
@@ -67,7 +67,7 @@ def fit_noise_curve(level: FloatArray, variance: FloatArray, energy: FloatArray)
     known = found[:, :, 0].mean(axis=1)
     design = np.zeros((2 * len(found), len(found) + 1))
     design[np.arange(2 * len(found)), np.repeat(np.arange(len(found)), 2)] = 1
-    scale = max(float(found[..., 2].max()), 1e-18)
+    scale = float(found[..., 2].max()) or 1.0
     design[:, -1] = found[..., 2].ravel() / scale
     variances, _ = nonnegative_least_squares(design, found[..., 1].ravel())
     return NoiseCurve(known, variances[:-1])
@@ -91,7 +91,7 @@ def photon_noise(first: FloatArray, second: FloatArray) -> NoiseCurve | None:
     line, residual = nonnegative_least_squares(np.stack([np.ones_like(above), above], axis=1), found.variances)
     variances = line[0] + line[1] * above
     spread = float(np.linalg.norm(found.variances - found.variances.mean()))
-    if residual > _STRAIGHT * spread or variances[-1] < _PHOTONS * max(variances[0], 1e-12):
+    if residual > _STRAIGHT * spread or variances[-1] < _PHOTONS * max(variances[0], ROUNDING**2):
         return None
     curve = NoiseCurve(found.levels, variances)
     return NoiseCurve(found.levels, variances / float(curve.variance(level).mean()))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import ROUNDING
+
 # Standard deviation of normal numbers in their median absolute one: 1 / Φ⁻¹(3/4).
 MEDIAN_DEVIATION = 1.4826
 # Tukey's constant, in standard deviations: fits by these weights keep 95 % of the efficiency of least squares.
@@ -16,9 +18,9 @@ def robust_scale(residuals: NDArray[np.floating]) -> float:
     return MEDIAN_DEVIATION * float(np.median(np.abs(residuals))) if residuals.size else 0.0
 
 
-def bisquare_weights(residuals: NDArray[np.floating], scale: float, least: float) -> NDArray[np.floating]:
-    """Return Tukey's weights, from 1 for no residual to 0 beyond 4.685 of their ``scale``, or beyond ``least``."""
-    return np.clip(1 - (residuals / max(_TUKEY * scale, least)) ** 2, 0, 1) ** 2
+def bisquare_weights(residuals: NDArray[np.floating], scale: float) -> NDArray[np.floating]:
+    """Return Tukey's weights, from 1 for no residual to 0 beyond 4.685 of their ``scale``."""
+    return np.clip(1 - (residuals / max(_TUKEY * scale, ROUNDING)) ** 2, 0, 1) ** 2
 
 
 def spread(count: int, most: int) -> list[int]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray, check_flow, check_grey, check_image
+from ..core.arrays import ROUNDING, FloatArray, check_flow, check_grey, check_image
 from ..core.errors import DataError
 from ..runtime.scratch import iter_frames, variance_of
 from .figure import FONT, INK, REST, WIDTH, new_figure, set_labels
@@ -107,7 +107,7 @@ def _draw_map(values: FloatArray, image: ArrayLike | None, title: str) -> tuple[
     reduced = shrink(values, _MAP_SIDE)
     axes = figure.add_subplot()
     extent = (-0.5, width - 0.5, height - 0.5, -0.5)
-    top = max(float(np.quantile(values, _SCALE_QUANTILE)), 1e-6)
+    top = max(float(np.quantile(values, _SCALE_QUANTILE)), ROUNDING)
     # Only now is it known to be installed.
     import matplotlib as mpl
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray
+from ..core.arrays import ROUNDING, FloatArray
 from ..core.errors import DataError
 from ..display.preview import preview
 from ..display.spectra import plot_dynamics
@@ -95,7 +95,7 @@ class FlowDynamics:
 
     def _repr_html_(self) -> str:
         spread = np.sqrt(self.flow_variance).astype(np.float32)
-        return preview("Flow dynamics", self._facts(), spread / max(float(spread.max()), 1e-6))
+        return preview("Flow dynamics", self._facts(), spread / max(float(spread.max()), ROUNDING))
 
     def _facts(self) -> list[tuple[str, str]]:
         spread = np.sqrt(self.flow_variance)

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ..core.arrays import FloatArray, luminance
+from ..core.arrays import ROUNDING, FloatArray, luminance
 from ..registration.warp import inside, warp
 from ..runtime.device import CPU
 from ..runtime.image_stacks import Stack, correlate, load, load_image, namespace, warp_stack
@@ -126,7 +126,7 @@ def frame_noise_variance(
     """
     xp, beta = namespace(grey), float(sharpness_weight)
     projection = project_gradient(grey, statistics.template)
-    sharpness = float(projection.sum()) / max(statistics.template_energy, 1e-12)
+    sharpness = float(projection.sum()) / max(statistics.template_energy, ROUNDING**2)
     if beta == 0:
         return xp.full_like(grey, statistics.image_noise), sharpness
     excess = squared_deviation(grey, statistics.mean_frame, statistics.deviation) / OUTLIER

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from ..core.arrays import FloatArray, luminance
+from ..core.arrays import ROUNDING, FloatArray, luminance
 from ..core.noise import fit_noise_curve
 from ..core.noise_spectrum import NoiseSpectrum
 from ..registration.registered_noise import noise_of_frames
@@ -263,7 +263,7 @@ def _leave_middle_out(
     divergence = smooth((gradient(template[0])[0] + gradient(template[1])[1]) ** 2, window / np.sqrt(2))
     # ∫ g² and, along one axis, ∫ (∇g)² of a Gaussian of deviation s are 1 / (4π s²) and 1 / (8π s⁴).
     inside, border = noise * divergence / (4 * np.pi * window**2), noise * energy / (8 * np.pi * window**4)
-    share = min(float((inside + border).sum() / max(moments.whole_spread.sum(), 1e-18)), 1.0)
+    share = min(float((inside + border).sum() / max(moments.whole_spread.sum(), ROUNDING**2)), 1.0)
     if share < _LEAST_SHARE:
         # A bound, as if the gradients of the noise did not cancel: the score still contains the pixel's own noise.
         bound = noise * energy * (_SOBEL_NOISE * _SOBEL_AREA / (4 * np.pi * window**2))
@@ -283,7 +283,8 @@ def _score_scale(sharpness: np.ndarray, spread: np.ndarray, explained: np.ndarra
     Noise explains a part of the variance ``spread``; the rest is sharpness.
     """
     deviation = np.sqrt(np.maximum(spread - explained, 0.0))
-    return (deviation / np.maximum(spread + (_LEAST_SPREAD * sharpness) ** 2, 1e-18)).astype(np.float32)
+    whole = spread + (_LEAST_SPREAD * sharpness) ** 2
+    return np.divide(deviation, whole, out=np.zeros_like(whole), where=whole > 0).astype(np.float32)
 
 
 def _sharpness_weight(sharpness: np.ndarray, spread: np.ndarray, score_variance: np.ndarray, noise: float) -> float:
@@ -293,8 +294,8 @@ def _sharpness_weight(sharpness: np.ndarray, spread: np.ndarray, score_variance:
     sharpness, of variance ``spread`` without noise, is one of the squared gradient: its square over the sharpness is
     the energy that blur takes and gives from frame to frame.
     """
-    gained = max(float(spread.sum() / max(np.abs(sharpness).sum(), 1e-18)), 0.0)
-    allowed = _PRICE * gained / max(noise, 1e-18)
+    gained = max(float(spread.sum() / max(np.abs(sharpness).sum(), ROUNDING**2)), 0.0)
+    allowed = _PRICE * gained / max(noise, ROUNDING**2)
     low, high = 0.0, _LARGEST_WEIGHT
     if float(np.expm1(high**2 * score_variance).mean()) <= allowed:
         return high

@@ -39,6 +39,7 @@ from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import known_shifts
 from ..registration.flow_methods.opencv_flow import DisParams, dis_solver
 from ..runtime.scratch import iter_frames
+from .correction import Correction
 from .placement import Placement, reduce_frames, relative_window
 from .survey import Survey
 
@@ -119,22 +120,22 @@ class _Model:
         return dataclasses.replace(self, excess=None)
 
 
-def without_moving_objects(survey: Survey) -> tuple[FrameSource, tuple[Decision, ...]]:
-    """Replace moving objects by the background; a clip without them is returned as it is.
+def find_moving_objects(survey: Survey) -> Correction | None:
+    """Find moving objects, which are replaced by the background.
 
     If there are any, all frames are read once more, because each shows another part of the background.
     """
     source = survey.clip
     found = _model_background(survey) if len(source) >= _FEWEST else None
     if found is None:
-        return source, ()
+        return None
     model, placement = found
     background, share, touched = _average_background(source, model, placement)
     reason = f"they cover {share:.1%} of a frame on average, and {touched:.0%} of the scene at some time"
     if model.excess is not None:
         reason += "; small ones such as snow or rain are among them"
     decision = Decision("moving objects", "replaced by the background", reason)
-    return source.adjusted(background.shown), (decision,)
+    return Correction((decision,), background.shown, replaces_objects=True)
 
 
 def _model_background(survey: Survey) -> tuple[_Model, Placement] | None:

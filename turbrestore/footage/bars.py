@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..io.source import Window
+from .correction import Correction
 from .placement import relative_window
 from .survey import Survey
 
@@ -44,8 +45,8 @@ class Bars:
         return with_bars
 
 
-def without_bars(survey: Survey) -> tuple[Survey, Bars | None, tuple[Decision, ...]]:
-    """Fill bars with the mirrored picture; frames without bars are returned as they are."""
+def find_bars(survey: Survey) -> Correction | None:
+    """Find bars, which are filled with the mirrored picture."""
     mean, lowest, highest = _extremes(survey)
     height, width = lowest.shape
     uneven = (highest - lowest > _EVEN) | (highest > _DARK)
@@ -55,19 +56,17 @@ def without_bars(survey: Survey) -> tuple[Survey, Bars | None, tuple[Decision, .
     sizes = {"top": rows.start, "bottom": height - rows.stop, "left": columns.start, "right": width - columns.stop}
     found = {side: size for side, size in sizes.items() if size}
     if not found or (rows.stop - rows.start) * (columns.stop - columns.start) < _LEAST_PICTURE * height * width:
-        return survey, None, ()
-    before, own = survey.clip.adjust, survey.clip.window
-    places = [_mirrored(part, length) for part, length in zip(picture, (height, width), strict=True)]
+        return None
+    clip = survey.clip
+    down, across = (_mirrored(part, length) for part, length in zip(picture, (height, width), strict=True))
 
-    def adjust(number: int, values: FloatArray, window: Window) -> FloatArray:
-        if window != own:
+    def fill(number: int, values: FloatArray, window: Window) -> FloatArray:
+        if window != clip.window:
             # A window of the frame may not hold what is mirrored into it.
-            whole = next(iter(dataclasses.replace(filled, numbers=(number,), timestamps=None)))
-            return whole[relative_window(own, window)]
-        values = values if before is None else before(number, values, window)
-        return values[places[0]][:, places[1]]
+            whole = next(iter(dataclasses.replace(clip, numbers=(number,), timestamps=None)))
+            return fill(number, whole, clip.window)[relative_window(clip.window, window)]
+        return values[down][:, across]
 
-    filled = dataclasses.replace(survey.clip, adjust=adjust)
     small = survey.small
     for axis, (part, length) in enumerate(zip(picture, (height, width), strict=True), 1):
         share = small.shape[axis] / length
@@ -76,7 +75,7 @@ def without_bars(survey: Survey) -> tuple[Survey, Bars | None, tuple[Decision, .
     text = ", ".join(f"{side} {size}" for side, size in found.items())
     choice = f"left out of the computation and put back: {text} pixels"
     decision = Decision("bars", choice, "they are even and dark in every frame")
-    return dataclasses.replace(survey, clip=filled, small=small), Bars(picture, mean), (decision,)
+    return Correction((decision,), fill, small, picture=picture, put_back=Bars(picture, mean).put_back)
 
 
 def _mirrored(inside: slice, length: int) -> NDArray[np.int_]:

@@ -18,9 +18,6 @@ move less by an order of magnitude than those of the scene.
 A watermark is a title that the scene shows through, by which its pixels vary.  Under them no frame is continued well
 from around, and what is found of it are those letters behind which the scene is flat.  It is named; where the camera
 moves it stays in the frames, which are registered by the scene.
-
-The digits of a clock change, but from one frame to the next most of their strokes stay, as no edge does that the air
-moves.  Where an overlay has been found, the places of such strokes belong to it.
 """
 
 from __future__ import annotations
@@ -28,13 +25,12 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, luminance
+from ..core.arrays import ROUNDING, FloatArray, luminance
 from ..core.decision import Decision
 from ..core.errors import DataError
 from ..core.gradient import sobel_gradient
@@ -42,20 +38,32 @@ from ..core.verdict import CheckKind
 from ..io.images.image_files import read_image
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import known_shifts
+from .checks.clocks import (
+    BESIDE,
+    DEVIATIONS,
+    FEWEST_STROKES,
+    LINE,
+    STILL,
+    around,
+    clock_digits,
+    regions,
+    with_gaps,
+)
 from .checks.missing_pixels import continued
+from .correction import Correction
 from .placement import Placement, relative_window
-from .survey import Moments, Survey, measure_moments
+from .survey import Moments, Survey
 
-# Fewest and most frames of a clip in which an overlay is looked for.
-FEWEST, _MOST = 3, 1500
+# Fewest frames of a clip in which an overlay is looked for.
+FEWEST = 3
 # Root mean square of the shifts of the camera, pixels, from which the scene counts as moving.
 _LEAST_MOTION = 3.0
-# An edge is static if it varies by less than its gradient times this share of the motion of the edges, or one pixel,
-# and if its gradient is that many times the noise; with a static camera, the edges move by at least so many pixels.
-_STATIC, _DEVIATIONS, _LEAST_BENDING = 1 / 3, 8.0, 0.3
-# Deviation of a static pixel, in units of the noise of a frame.  The least change that counts is one level of 8 bits,
-# or less in a clip whose range, between these percentiles, is below this share of full scale.
-_STILL, _SPAN, _RANGE = 2.5, 0.5, (1, 99)
+# An edge is static if it varies by less than its gradient times this share of the motion of the edges, or one pixel;
+# with a static camera, the edges move by at least so many pixels.
+_STATIC, _LEAST_BENDING = 1 / 3, 0.3
+# The least change that counts is one level of 8 bits, or less in a clip whose range, between these percentiles, is
+# below this share of full scale.
+_SPAN, _RANGE = 0.5, (1, 99)
 # Largest deviation of pixels without noise, in units of the noise, and level of a dark stop, from black to the scene.
 _CONSTANT, _DARK = 0.5, 0.25
 # Fewest static edge pixels of an overlay, as a share of the frame, and the largest part of a frame that it may cover.
@@ -65,9 +73,9 @@ _REPORTED = 0.002
 # Pixels around an overlay that are replaced too, reach of the fill under which shifts are measured, and the share of a
 # reduced pixel beside an overlay that has to show the scene.
 _AROUND, _REACH, _FREE = 2, 12.0, 0.9
-# With a static camera: radius around static edges in which what has no noise belongs to them, and of the gaps
-# between letters; pixels around them over which the overlay fades.
-_NEAR, _GAP, _FADE = 4, 2, 0.7
+# With a static camera: radius around static edges in which what has no noise belongs to them; pixels around them over
+# which the overlay fades.
+_NEAR, _FADE = 4, 0.7
 # An edge is drawn over the scene if its deviation is below that of the noise by this factor, or its motion below that
 # of the edges of the scene by this one.
 _NOISELESS, _DRAWN = 0.7, 1 / 8
@@ -80,19 +88,6 @@ _MOVED, _MOTION = 0.5, 0.5
 # cup, a person and bricks behind words of an opacity of 0.35 or less, 0.02 or less does, with a static or a shaking
 # camera; behind opaque words of three styles, as stored and after H.264, 0.05 or more does.
 _SEEN_THROUGH = 0.03
-# Strokes of a clock: largest change of a pixel that stays, in units of the noise and in grey levels; least share of
-# the frames that have an edge there, and of these in which it stays; fewest connected pixels.
-_SAME, _LEAST_SAME, _OFTEN, _REMAINS, _FEWEST_STROKES = 1.0, 1.5, 0.2, 0.25, 12
-# Fewest frames in which it stays, and the share that 10 % of the edges exceed in a scene that moves by a pixel.
-_TIMES, _USUAL, _ALMOST_USUAL = 2, 0.15, 1.5
-# Largest part of the frame that digits take.
-_MOST_DIGITS = 0.1
-# Distance from other strokes, pixels, within which a stroke may stay in fewer frames, and the least share of them.
-_BESIDE, _REMAINS_BESIDE = 8, 0.18
-# Largest distance of digits from an overlay: the height of the frame over this.
-_LINE = 10
-# Most frames in which strokes are looked for.
-_LOOKED_AT = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +132,7 @@ class Title:
     def at_rest(self, frame: FloatArray, noise: float) -> Title | None:
         """Keep the parts whose edges have not moved: blocks that a coder copies look drawn for a while."""
         before, gradient, parts = self._pixels
-        edges = gradient > _DEVIATIONS * noise
+        edges = gradient > DEVIATIONS * noise
         moved = edges & (np.abs(luminance(frame)[self.mask] - before) > _MOTION * gradient)
         of_all, gone = (np.bincount(parts, gradient**2 * pixels) for pixels in (edges, moved))
         still = (gone <= _MOVED * of_all)[parts]
@@ -174,63 +169,100 @@ def read_static_mask(path: str | os.PathLike[str], source: FrameSource) -> NDArr
     return marked
 
 
-def without_overlay(
-    survey: Survey, mask: NDArray[np.bool_] | None = None, moments: Moments | None = None, titles_only: bool = False
-) -> tuple[Survey, NDArray[np.bool_] | None, Title | None, tuple[Decision, ...]]:
-    """Replace the static overlay of a clip; frames without one are returned as they are.
+@dataclass(frozen=True, eq=False)
+class _Static:
+    """What is static in a clip, and how the scene moves behind it."""
 
-    Return the frames, the pixels (H, W) of the scene that no frame shows, the title that has to be put back into
-    results because the camera is static as well, and the decisions. ``mask`` (H, W) names the pixels that are replaced;
-    ``moments`` are those of the survey, if they are known.  With ``titles_only`` a moving camera keeps its overlay.
+    mask: NDArray[np.bool_]  # (H, W)
+    small: FloatArray  # (T, h, w[, 3]): reduced frames without it
+    shifts: NDArray[np.float64]  # (T, 2): of the camera, pixels
+    title: Title | None = None  # what it is if the camera is static
+    digits: NDArray[np.bool_] | None = None  # (H, W): those that change
+
+    @property
+    def moves(self) -> bool:
+        """Whether the camera moves."""
+        return float(np.sqrt(np.mean(np.sum(self.shifts**2, axis=1)))) >= _LEAST_MOTION
+
+
+def find_title(survey: Survey) -> Title | None:
+    """Find the title that a static camera has drawn over its frames."""
+    found = _find_static(survey)
+    return None if found is None or found.moves else found.title
+
+
+def find_overlay(survey: Survey, mask: NDArray[np.bool_] | None = None) -> Correction | None:
+    """Find the static overlay of a clip, which is replaced by the scene or, if the camera is static, put back.
+
+    ``mask`` (H, W) names the pixels that are replaced.
     """
-    given, title = mask is not None, None
-    if mask is None and FEWEST <= len(survey.small) <= _MOST:
-        moments = moments or measure_moments(survey)
-        level = _grey_level(survey, moments)
-        mask, title = _static_regions(survey.clip, moments, level)
-        if mask is not None:
-            digits = _digits(survey.clip, moments, level, mask if title is None else title.mask)
-            mask, title = _with_digits(mask, title, digits)
-    if mask is None:
-        return survey, None, None, ()
-    small, seen_through = _continued_small(survey.small, mask), title is not None and title.seen_through
-    shown = luminance(small)
-    # What is not found of such a title holds measured shifts back, and is gone without the mean of the frames.
-    shifts = known_shifts(shown - shown.mean(axis=0) if seen_through else shown)[0]
-    shifts *= (mask.shape[1] / small.shape[2], mask.shape[0] / small.shape[1])
-    if not given and float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) < _LEAST_MOTION:
-        return (survey, None, None, ()) if title is None else _with_title_kept(survey, small, title)
-    reason = "the scene moves behind it and shows through it"
-    left = Decision("overlay", "left in the frames", reason, CheckKind.WATERMARK)
-    if titles_only or seen_through:
-        return survey, None, None, (left,) if seen_through else ()
-    if moments is not None and not given:
-        mask, _ = _static_regions(survey.clip, moments, level, shifts)
+    if mask is not None:
+        return _replaced(survey, _Static(mask, *_behind(survey, mask, None)), "asked for")
+    found = _find_static(survey)
+    if found is None:
+        return None
+    if found.moves:
+        return _uncovered(survey, found)
+    return None if found.title is None else _kept(found.small, found.title)
+
+
+def _uncovered(survey: Survey, found: _Static) -> Correction | None:
+    """Replace the overlay of a camera that moves, unless the scene shows through it."""
+    moments, mask = survey.moments, None
+    seen_through = found.title is not None and found.title.seen_through
+    if not seen_through:
+        level = _grey_level(survey)
+        mask, _ = _static_regions(survey.clip, moments, level, found.shifts)
         if mask is None:
-            return survey, None, None, ()
-        constant = np.sqrt(moments.variance) < _CONSTANT * max(moments.noise, level / _STILL)
-        if _is_seen_through(mask, luminance(moments.mean), constant, _AROUND):
-            return survey, None, None, (left,)
-        mask, _ = _with_digits(mask, None, digits & _around(mask, len(mask) // _LINE))
-    overlay = _overlay(survey, mask, shifts)
-    choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced by what other frames show"
-    reason = "asked for" if given else "it is static while the scene moves"
-    unseen = float(overlay.hidden.mean())
+            return None
+        constant = np.sqrt(moments.variance) < _CONSTANT * max(moments.noise, level / STILL)
+        seen_through = _is_seen_through(mask, luminance(moments.mean), constant, _AROUND)
+    if mask is None or seen_through:
+        reason = "the scene moves behind it and shows through it"
+        return Correction((Decision("overlay", "left in the frames", reason, CheckKind.WATERMARK),))
+    if found.digits is not None:
+        mask, _ = _with_digits(mask, None, found.digits & around(mask, len(mask) // LINE))
+    return _replaced(survey, replace(found, mask=mask), "it is static while the scene moves")
+
+
+def _find_static(survey: Survey) -> _Static | None:
+    if len(survey.small) < FEWEST:
+        return None
+    level = _grey_level(survey)
+    mask, title = _static_regions(survey.clip, survey.moments, level)
+    if mask is None:
+        return None
+    digits = clock_digits(survey, level, mask if title is None else title.mask)
+    mask, title = _with_digits(mask, title, digits)
+    return _Static(mask, *_behind(survey, mask, title), title, digits)
+
+
+def _behind(survey: Survey, mask: NDArray[np.bool_], title: Title | None) -> tuple[FloatArray, NDArray[np.float64]]:
+    """Reduced frames (T, h, w[, 3]) without what is static, and the shifts of the camera (T, 2) in pixels."""
+    small = _continued_small(survey.small, mask)
+    shown = luminance(small)
+    # What is not found of a title that is seen through holds measured shifts back, and is gone without the mean.
+    shown = shown - shown.mean(axis=0) if title is not None and title.seen_through else shown
+    return small, known_shifts(shown)[0] * (mask.shape[1] / small.shape[2], mask.shape[0] / small.shape[1])
+
+
+def _replaced(survey: Survey, found: _Static, reason: str) -> Correction:
+    """Replace an overlay by what other frames show there."""
+    overlay, share = _overlay(survey, found.mask, found.shifts), f"{100 * float(found.mask.mean()):.1f} % of the frame"
+    choice, unseen = f"{share} replaced by what other frames show", float(overlay.hidden.mean())
     if unseen >= _REPORTED:
-        choice = f"{100 * float(mask.mean()):.1f} % of the frame replaced"
+        choice = f"{share} replaced"
         reason += f"; {100 * unseen:.1f} % is shown by no frame and filled from around, the rest by others"
-    decision = Decision("overlay", choice, reason)
-    return survey.adjusted(overlay.without, small), overlay.hidden, None, (decision,)
+    return Correction((Decision("overlay", choice, reason),), overlay.without, found.small, overlay.hidden)
 
 
-def _with_title_kept(
-    survey: Survey, small: FloatArray, title: Title
-) -> tuple[Survey, NDArray[np.bool_] | None, Title, tuple[Decision, ...]]:
+def _kept(small: FloatArray, title: Title) -> Correction:
     """Continue the scene over a title; the pixels under one that the scene shows through do not count as hidden."""
     choice = f"{100 * float(title.mask.mean()):.1f} % of the frame kept as in the mean of the frames"
     reason = "it is static while the air bends the scene around it; it is neither moved nor deblurred"
     check, hidden = (CheckKind.WATERMARK, None) if title.seen_through else (None, title.mask)
-    return survey.adjusted(title.without, small), hidden, title, (Decision("overlay", choice, reason, check),)
+    decision = Decision("overlay", choice, reason, check)
+    return Correction((decision,), title.without, small, hidden, put_back=title.put_back)
 
 
 def _static_regions(
@@ -241,16 +273,16 @@ def _static_regions(
     Where ``shifts`` (T, 2) of the camera are known, what lies along its path does not count.
     """
     mean, deviation = luminance(moments.mean), np.sqrt(moments.variance)
-    noise = max(moments.noise, level / _STILL)
-    still = deviation < _STILL * noise
+    noise = max(moments.noise, level / STILL)
+    still = deviation < STILL * noise
     gradient = np.hypot(*sobel_gradient(mean))
-    clear = gradient > _DEVIATIONS * noise
+    clear = gradient > DEVIATIONS * noise
     moved = np.maximum(deviation[clear] ** 2 - moments.noise**2, 0) / gradient[clear] ** 2
     motion = measured = float(np.sqrt(np.median(moved))) if moved.size else 0.0
     if shifts is not None:
         slopes = sobel_gradient(mean)
         across = np.einsum("iyx,ij,jyx->yx", slopes, np.cov(shifts.T), slopes)
-        motion = np.minimum(measured, np.sqrt(np.maximum(across, 0)) / np.maximum(gradient, 1e-6))
+        motion = np.minimum(measured, np.sqrt(np.maximum(across, 0)) / np.maximum(gradient, ROUNDING))
     edges = still & clear & (gradient * np.minimum(_STATIC * motion, 1.0) > deviation)
     # A title has no noise of the camera, unless a coder spreads noise over it.
     drawn = _titles(clear & (deviation < np.maximum(_DRAWN * motion * gradient, _NOISELESS * noise)), clear)
@@ -260,27 +292,27 @@ def _static_regions(
     # A flat part of the scene does not change either; an overlay lacks the noise of the scene, or is dark like a stop.
     black = float(mean.min())
     dark = mean < black + _DARK * (float(np.median(mean[~still])) - black) if (~still).any() else still
-    mask = _regions((still & dark) | constant | edges | drawn, edges | drawn)
+    mask = regions((still & dark) | constant | edges | drawn, edges | drawn)
     if mask.mean() > _LARGEST:
         return None, None
-    mask = _around(mask, _AROUND)
+    mask = around(mask, _AROUND)
     if not drawn.any() or measured < _LEAST_BENDING:
         return mask, None
-    letters = _around(_with_gaps(_regions((constant & _around(drawn, _NEAR)) | drawn, drawn)) > 0, 1)
+    letters = around(with_gaps(regions((constant & around(drawn, _NEAR)) | drawn, drawn)) > 0, 1)
     return mask, Title(letters, moments.mean, source.window, _is_seen_through(letters, mean, constant, 1))
 
 
 def _is_seen_through(mask: NDArray[np.bool_], mean: FloatArray, constant: NDArray[np.bool_], edge: int) -> bool:
     """Tell whether hardly any static pixel lacks noise, apart from the edge; a stop has noise too, but is dark."""
-    inner = ~_around(~mask, edge)
+    inner = ~around(~mask, edge)
     if not inner.any() or float(constant[inner].mean()) >= _SEEN_THROUGH:
         return False
     return float(mean[mask].mean()) > float(continued(mean, ~mask)[mask].mean())
 
 
-def _grey_level(survey: Survey, moments: Moments) -> float:
+def _grey_level(survey: Survey) -> float:
     """Least change that counts: one level of 8 bits, or less for a dim clip of finer steps."""
-    low, high = np.percentile(luminance(moments.mean), _RANGE)
+    low, high = np.percentile(luminance(survey.moments.mean), _RANGE)
     # The numbers of a file may be of fewer bits than its type.
     step = np.diff(np.unique(survey.pixels[0])).min(initial=survey.clip.full_scale) / survey.clip.full_scale
     return min(max(float(high - low) / _SPAN / 255, float(step), 1 / (2**survey.clip.bit_depth - 1)), 1 / 255)
@@ -291,79 +323,27 @@ def _titles(drawn: NDArray[np.bool_], clear: NDArray[np.bool_]) -> NDArray[np.bo
 
     A dark line along the border, a pixel or two wide, is no title.
     """
-    count, labels = cv2.connectedComponents(_with_gaps(drawn), connectivity=8)
+    count, labels = cv2.connectedComponents(with_gaps(drawn), connectivity=8)
     beside = cv2.dilate(labels.astype(np.float32), np.ones((3, 3), np.uint8))
     inner = np.zeros_like(drawn)
     inner[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
     found, all_edges = (np.bincount(beside[pixels & inner].astype(int), minlength=count) for pixels in (drawn, clear))
-    many = (found >= _FEWEST_STROKES) & (found >= _LEAST_DRAWN * all_edges)
+    many = (found >= FEWEST_STROKES) & (found >= _LEAST_DRAWN * all_edges)
     many[0] = False
-    return drawn & _around(many[labels], len(drawn) // _LINE)
-
-
-def _digits(source: FrameSource, moments: Moments, level: float, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mark strokes that stay from one frame to the next, and change at times; with the gaps between them."""
-    same, clear = max(_SAME * moments.noise, _LEAST_SAME * level), _DEVIATIONS * max(moments.noise, level / _STILL)
-    edges, static = np.zeros((2, *source.shape[1:3]), np.int16)
-    part, before = source.select((0, len(source), max(1, len(source) // _LOOKED_AT))), None
-    for frame in part:
-        grey = luminance(frame)
-        if before is not None:
-            edge = np.hypot(*sobel_gradient(grey)) > clear
-            edges += edge
-            static += edge & (np.abs(grey - before) < same)
-        before = grey
-    # What is static all the time is found by its deviation.
-    moving = (edges >= _OFTEN * (len(part) - 1)) & (moments.variance > (_STILL * same) ** 2)
-    if not moving.any():
-        return moving
-    share = np.where(moving, np.divide(static, np.maximum(edges, 1), dtype=np.float64), 0)
-    # Where the scene hardly moves, its edges stay at times as well.
-    usual = max(float(np.quantile(share[moving], 0.9)) / _USUAL, 1.0)
-    share[static < _TIMES] = 0
-    # A clock has a colon, a date or digits that do not change; blocks that a coder copies lie anywhere.
-    digits = _large(_around(mask, len(mask) // _LINE) & (share > _REMAINS * usual))
-    if usual <= _ALMOST_USUAL:
-        near = _around(digits | mask, _BESIDE)
-        digits |= _large(near & (share > _REMAINS_BESIDE * usual))
-    return digits if digits.mean() <= _MOST_DIGITS else np.zeros_like(digits)
-
-
-def _large(strokes: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Regions of many strokes, with the gaps between them."""
-    return _regions(_with_gaps(strokes), strokes, _FEWEST_STROKES)
-
-
-def _with_gaps(strokes: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Add the gaps between strokes, 0 or 1."""
-    closed = cv2.morphologyEx(strokes.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((2 * _GAP + 1,) * 2, np.uint8))
-    return np.asarray(closed, np.uint8)
+    return drawn & around(many[labels], len(drawn) // LINE)
 
 
 def _with_digits(
     mask: NDArray[np.bool_], title: Title | None, digits: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], Title | None]:
     """Add digits, and a pixel around them, to an overlay; a digit that a box surrounds is a hole in it."""
-    wide = _around(digits, 2)
+    wide = around(digits, 2)
     if title is None:
         return mask | wide, None
     letters = title.mask | wide
     _, labels, sizes, _ = cv2.connectedComponentsWithStats((~letters).astype(np.uint8), connectivity=4)
-    letters |= (sizes[:, cv2.CC_STAT_AREA] <= (2 * _BESIDE + 1) ** 2)[labels]
+    letters |= (sizes[:, cv2.CC_STAT_AREA] <= (2 * BESIDE + 1) ** 2)[labels]
     return mask | wide, replace(title, mask=letters)
-
-
-def _regions(grown: NDArray[Any], marks: NDArray[np.bool_], fewest: int = 1) -> NDArray[np.bool_]:
-    """Keep the connected regions that have enough marks."""
-    _, labels = cv2.connectedComponents(grown.astype(np.uint8), connectivity=8)
-    counts = np.bincount(labels[marks], minlength=int(labels.max()) + 1)
-    counts[0] = 0
-    return np.asarray((counts >= fewest)[labels])
-
-
-def _around(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
-    """Mark what lies up to a radius from what is marked."""
-    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * radius + 1,) * 2, np.uint8)) > 0
 
 
 def _continued_small(small: FloatArray, mask: NDArray[np.bool_]) -> FloatArray:

@@ -25,12 +25,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, luminance
+from ..core.arrays import ROUNDING, FloatArray, luminance
 from ..core.decision import Decision
 from ..core.gradient import sobel_gradient
 from ..core.robust import robust_scale
 from ..core.thresholds import threshold
 from ..io.source import Window
+from .correction import Correction
 from .placement import relative_window
 from .survey import Moments, Survey
 
@@ -71,11 +72,12 @@ class PixelPattern:
         return values - self.offsets[_segment(self.starts, number)][relative_window(self.window, window)]
 
 
-def without_pixel_pattern(survey: Survey, moments: Moments) -> tuple[Survey, tuple[Decision, ...]]:
-    """Subtract the offsets of all pixels; frames without a clear pattern are returned as they are."""
+def find_pixel_pattern(survey: Survey) -> Correction | None:
+    """Find a clear pattern of the offsets of all pixels, which is subtracted."""
+    moments = survey.moments
     motion = _motion_beside_pattern(moments)
     if motion is None:
-        return survey, ()
+        return None
     starts = _segment_starts(survey, moments)
     means, counts = _means_of_segments(survey, starts)
     noise = float(np.median(moments.change))
@@ -87,7 +89,7 @@ def without_pixel_pattern(survey: Survey, moments: Moments) -> tuple[Survey, tup
     size = 100 * float(np.sqrt(np.mean(np.square(offsets))))
     choice = f"offsets of single pixels{changes} subtracted: {size:.2g} % of full scale"
     decision = Decision("sensor", choice, "they are static while the air moves the scene")
-    return survey.adjusted(pattern.without), (decision,)
+    return Correction((decision,), pattern.without)
 
 
 def _motion_beside_pattern(moments: Moments) -> NDArray[np.bool_] | None:
@@ -184,7 +186,7 @@ def _white_part(image: FloatArray, noise: float = 0.0) -> FloatArray:
     rings = (frequency * min(height, width) / 4).astype(np.int64)
     power = np.bincount(rings.ravel(), np.square(spectrum).ravel()) / np.maximum(np.bincount(rings.ravel()), 1)
     share = np.divide(white, power, out=np.ones_like(power), where=power > white).astype(np.float32)
-    share *= np.float32(max(1 - noise / max(white, 1e-18), 0.0))
+    share *= np.float32(max(1 - noise / max(white, ROUNDING**2), 0.0))
     offsets = scipy.fft.idctn(spectrum * share[rings], norm="ortho")
     return np.asarray(offsets * _usual(offsets), np.float32)
 

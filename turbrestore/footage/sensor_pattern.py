@@ -25,8 +25,9 @@ from ..core.decision import Decision
 from ..core.gradient import sobel_gradient
 from ..core.thresholds import threshold
 from ..io.source import Window
+from .correction import Correction
 from .placement import relative_window
-from .survey import Moments, Survey, measure_moments
+from .survey import Survey
 
 
 @dataclass(frozen=True)
@@ -88,18 +89,15 @@ class _Stripes:
         return _filled(flat.swapaxes(0, 1), self.dead[1][rows]).swapaxes(0, 1)
 
 
-def without_stripes(survey: Survey, moments: Moments | None = None) -> tuple[Survey, tuple[Decision, ...]]:
-    """Take stripes of the sensor out of the frames; frames without them are returned as they are.
-
-    ``moments`` are those of the survey, if they are known.
-    """
+def find_stripes(survey: Survey) -> Correction | None:
+    """Find stripes, dead columns and rows, and warm pixels of the sensor."""
     if len(survey.numbers) < _LIMITS.frames:
-        return survey, ()
-    moments = moments or measure_moments(survey)
+        return None
+    moments = survey.moments
     mean, variance, usual = luminance(moments.mean), moments.change, max(moments.noise, 1e-4)
     motion = _motion(mean, variance, usual)
     if motion < _LIMITS.motion:
-        return survey, ()
+        return None
     dead = (_dead(variance, usual), _dead(variance.T, usual))
     offsets = tuple(
         _offsets(_filled(image, gone), spread, usual / np.sqrt(moments.count), motion)
@@ -109,7 +107,7 @@ def without_stripes(survey: Survey, moments: Moments | None = None) -> tuple[Sur
     size = float(np.sqrt(sum(np.mean(offset**2) for offset in offsets)))
     warm = _warm(mean, variance, usual, motion)
     if not count and size == 0 and not warm.any():
-        return survey, ()
+        return None
     excess = _above_around(moments.mean) * (warm if moments.mean.ndim == 2 else warm[..., None]) if warm.any() else None
     stripes = _Stripes(excess, (offsets[0], offsets[1]), dead, survey.clip.window)
     kinds = [
@@ -118,7 +116,7 @@ def without_stripes(survey: Survey, moments: Moments | None = None) -> tuple[Sur
         *([f"{warm.sum()} warm pixels evened out"] if warm.any() else ()),
     ]
     decision = Decision("sensor", "; ".join(kinds), "they are static while the air moves the scene")
-    return survey.adjusted(stripes.without), (decision,)
+    return Correction((decision,), stripes.without)
 
 
 def _motion(mean: FloatArray, variance: FloatArray, noise: float) -> float:
@@ -133,7 +131,7 @@ def _motion(mean: FloatArray, variance: FloatArray, noise: float) -> float:
 
 def _offsets(mean: FloatArray, variance: FloatArray, error: float, motion: float) -> FloatArray:
     """Column offsets; all zero if they belong to the scene."""
-    fine = mean - cv2.GaussianBlur(mean, (0, 0), sigmaX=_LIMITS.across, sigmaY=1e-3)
+    fine = mean - cv2.GaussianBlur(mean, (0, 1), _LIMITS.across)
     offsets = np.median(fine, axis=0).astype(np.float32)
     size = float(np.sqrt(np.mean(np.median(np.abs(offsets)) ** 2)))
     parts = [np.median(part, axis=0) for part in np.array_split(fine, _LIMITS.parts)]

@@ -1,15 +1,15 @@
 """The survey of a clip: one pass over its frames, from which all questions about the clip are answered.
 
 A survey keeps every frame in a reduced size, and some frames, spread over the clip, as they are in the file.  What is
-looked for, such as bars beside the picture or a lamp that flickers, is a function from a survey to one in which the
-frames are corrected.
+looked for, such as bars beside the picture or a lamp that flickers, is a function from a survey to a correction.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -19,13 +19,25 @@ from ..core.arrays import FloatArray, luminance
 from ..core.noise import estimate_noise
 from ..core.robust import spread
 from ..io.pixels import PixelArray
-from ..io.source import FrameSource, Window
+from ..io.source import FrameSource
 from ..runtime.scratch import drop_pages, iter_frames, new_stack
+from .correction import Correction
 
 # Most and fewest frames that are kept whole; those beyond the fewest take at most so many bytes.
 _MOST, _FEWEST, _WHOLE_BYTES = 48, 9, 4e8
 # Longest and shortest side of reduced frames, pixels, and about how many numbers all of them are.
 _SIDE, _SHORTEST, _NUMBERS = 192, 16, 8e6
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Moments over time of some frames of a clip, from which static overlays and patterns are found."""
+
+    mean: FloatArray  # (H, W) or (H, W, 3)
+    variance: FloatArray  # (H, W): of the luminance
+    change: FloatArray  # (H, W): half of the mean squared difference from one frame to the next
+    noise: float  # standard deviation of the noise of a frame, median over the frames
+    count: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +52,17 @@ class Survey:
     def __iter__(self) -> Iterator[FloatArray]:
         return map(self.clip.intensities, self.numbers, iter_frames(self.pixels))
 
-    def adjusted(
-        self, adjust: Callable[[int, FloatArray, Window], FloatArray], small: FloatArray | None = None
-    ) -> Survey:
-        """Correct the frames; ``small`` are the corrected reduced ones, if what is corrected shows in them."""
-        return dataclasses.replace(self, clip=self.clip.adjusted(adjust), small=self.small if small is None else small)
+    @cached_property
+    def moments(self) -> Moments:
+        """Moments of the whole frames."""
+        return _measure_moments(self)
+
+    def corrected(self, correction: Correction) -> Survey:
+        """Correct the frames."""
+        if correction.apply is None:
+            return self
+        small = self.small if correction.small is None else correction.small
+        return dataclasses.replace(self, clip=self.clip.adjusted(correction.apply), small=small)
 
 
 def take_survey(clip: FrameSource, scratch: Path | None = None) -> Survey:
@@ -65,19 +83,7 @@ def take_survey(clip: FrameSource, scratch: Path | None = None) -> Survey:
     return Survey(clip, tuple(clip.numbers[place] for place in places), tuple(stack), small)
 
 
-@dataclass(frozen=True, eq=False)
-class Moments:
-    """Moments over time of some frames of a clip, from which static overlays and patterns are found."""
-
-    mean: FloatArray  # (H, W) or (H, W, 3)
-    variance: FloatArray  # (H, W): of the luminance
-    change: FloatArray  # (H, W): half of the mean squared difference from one frame to the next
-    noise: float  # standard deviation of the noise of a frame, median over the frames
-    count: int
-
-
-def measure_moments(survey: Survey) -> Moments:
-    """Take the moments of the whole frames of a survey."""
+def _measure_moments(survey: Survey) -> Moments:
     shape = survey.clip.shape[1:]
     sums, noise = np.zeros((3, *shape[:2])), list[float]()
     total = sums[0] if len(shape) == 2 else np.zeros(shape)

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
+from ..core.arrays import ROUNDING, FloatArray
 from ..core.errors import DataError, require
 from ..core.remarks import Doubt
 
@@ -146,7 +146,7 @@ def _demosaic_wide(pixels: PixelArray, pattern: str) -> PixelArray:
         near = np.array([[corner, 0.5, corner], [0.5, 1, 0.5], [corner, 0.5, corner]])
         total, weight = (cv2.filter2D(part, -1, near, borderType=cv2.BORDER_CONSTANT) for part in (own * values, own))
         # A frame of one row lacks a colour.
-        colours.append(total / np.maximum(weight, 1e-9))
+        colours.append(total / np.maximum(weight, ROUNDING))
     image = np.stack(colours, axis=-1)
     return (np.rint(image) if pixels.dtype.kind in "iu" else image).astype(pixels.dtype.newbyteorder("="))
 

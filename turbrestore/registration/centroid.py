@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import FloatArray, check_frames, luminance
+from ..core.arrays import ROUNDING, FloatArray, check_frames, luminance
 from ..core.errors import require, require_between
 from ..display.maps import plot_displacements
 from ..display.preview import preview
@@ -223,7 +223,7 @@ def centroid_steps(
             yield CentroidState(len(sizes) + 1, number + 1)
         mean_flow = mean_of(flows)  # W̄, eq. 12
         sizes.append(float(np.hypot(mean_flow[..., 0], mean_flow[..., 1]).mean()))
-        change = sizes[-1] / max(sizes[-2], 1e-9) if len(sizes) > 1 else 0.0
+        change = sizes[-1] / max(sizes[-2], ROUNDING) if len(sizes) > 1 else 0.0
         # The temporal mean is a blurred reference, so flow is measured from the first registered mean in any case.
         settled = not far and (len(sizes) > 1 or not fused or params.iterations == 1)
         converged = settled and (sizes[-1] <= params.tolerance or _STALLED < change <= _DIVERGED)

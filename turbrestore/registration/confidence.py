@@ -32,7 +32,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import FloatArray, check_grey
+from ..core.arrays import ROUNDING, FloatArray, check_grey
 from ..core.noise import estimate_noise
 from ..runtime.jit import jit
 
@@ -76,7 +76,7 @@ def flow_confidence(reference: ArrayLike) -> Tensors:
 def noise_share(image: ArrayLike, noise: float) -> float:
     """Share of the squared gradient of an image (H, W[, 3]) that is noise."""
     squares = sum(float(np.square(part).mean(dtype=np.float64)) for part in _gradient(check_grey(image)))
-    return 2 * _SCHARR_NOISE * noise**2 / max(squares, 1e-18)
+    return 2 * _SCHARR_NOISE * noise**2 / max(squares, ROUNDING**2)
 
 
 def regularise_flow(flow: FloatArray, tensors: Tensors, noise: float) -> FloatArray:

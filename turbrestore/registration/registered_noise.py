@@ -34,7 +34,7 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, luminance
+from ..core.arrays import ROUNDING, FloatArray, luminance
 from ..core.noise_spectrum import RINGS, NoiseSpectrum, fit_noise_spectrum
 from ..runtime.scratch import iter_frames
 from ..runtime.threads import map_ahead
@@ -153,7 +153,7 @@ def _gain_of_mean(
     window = np.ones(2 * _AROUND + 1)
     total, average = (np.convolve(values, window, "same") for values in (weights, weights * ratio))
     average /= total
-    error, k = average / np.sqrt(total), np.maximum(average - 1, 1e-12)
+    error, k = average / np.sqrt(total), np.maximum(average - 1, ROUNDING)
     # Chance of two standard errors tells no correlation, and hardly lessens one that is clear.
     k *= np.maximum(1 - np.square(2 * error / k), 0)
     largest, texture = (2 * rho / (1 + rho**2) for rho in (_LARGEST, _TEXTURE))

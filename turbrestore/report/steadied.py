@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, luminance
+from ..core.arrays import ROUNDING, FloatArray, luminance
 from ..core.remarks import counted
 from ..core.verdict import CheckKind, Verdict
 from ..display.curves import plot_over_frames
@@ -149,5 +149,5 @@ def _headline(figures: SteadyFigures, sharp: list[float], change: list[float]) -
         facts.append(Fact("Sharpness", f"×{np.nanmean(sharp):.2f}", "relative to the input"))
     if np.isfinite(change).any():
         facts.append(Fact("Change", f"×{np.nanmean(change):.2f}", "from frame to frame"))
-    rate = len(sharp) / max(figures.seconds, 1e-3)
+    rate = len(sharp) / max(figures.seconds, ROUNDING)
     return [*facts, Fact("Time", duration(figures.seconds), f"{rate:.1f} frames a second")]

@@ -38,7 +38,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, luminance
+from ..core.arrays import ROUNDING, FloatArray, luminance
 from ..core.errors import DataError
 from ..core.gradient import sobel_gradient
 from ..registration.warp import warp
@@ -59,8 +59,6 @@ _LARGEST_LAG = 0.5
 _SOLVING_STEPS = 20
 # Fewest independent frames of a long clip, and correlation of one frame with the next above which motion is slow.
 _LEAST_INDEPENDENT, _PERSISTENT = 10, 0.5
-# Least determinant of M per pixel, intensity to the fourth per pixel to the fourth.
-_TINY = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +134,7 @@ def block_displacement(
         xx, xy, yy, bx, by = (
             block_means(plane, side) for plane in (gx * gx, gx * gy, gy * gy, gx * target, gy * target)
         )
-        determinant = np.maximum(xx * yy - xy**2, _TINY)
+        determinant = np.maximum(xx * yy - xy**2, ROUNDING**2)
         moved = np.stack([yy * bx - xy * by, xx * by - xy * bx], axis=-1) / determinant[..., None]
         return moved, block_means(residual**2, side)
 
@@ -149,9 +147,9 @@ def block_displacement(
     w -= w.mean(axis=0)
     xx, xy, yy = (block_means(plane, side).astype(np.float64) for plane in (ix * ix, ix * iy, iy * iy))
     smallest = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
-    error = np.mean([square for _, square in solved], axis=0) / np.maximum(smallest * side**2, _TINY)
+    error = np.mean([square for _, square in solved], axis=0) / np.maximum(smallest * side**2, ROUNDING**2)
     counts = error < _LARGEST_ERROR * np.median(w.var(axis=0).mean(axis=-1))
-    inverse_trace = (xx + yy) / np.maximum(xx * yy - xy**2, _TINY) / side**2
+    inverse_trace = (xx + yy) / np.maximum(xx * yy - xy**2, ROUNDING**2) / side**2
     added = float(noise**2 * np.mean(inverse_trace[counts]) / 2) if counts.any() else np.inf
     return Displacement(w, counts, side, _window(ix**2 + iy**2, side, counts), added)
 
@@ -177,7 +175,7 @@ def motion_statistics(w: Float64Array, noise_variance: float) -> MotionStatistic
         correlation = np.append(correlation, 0.0)
     independent = frames / float(1 + share[1 : len(correlation)] @ correlation[1:] ** 2)
     measured = np.mean(w**2, axis=(0, 1))
-    variance = np.maximum(measured * true[0] / max(found[0], _TINY) - noise_variance, 0.01 * measured)
+    variance = np.maximum(measured * true[0] / max(found[0], ROUNDING**2) - noise_variance, 0.01 * measured)
     return MotionStatistics(variance, independent * _independent_values(flat, independent), independent, correlation)
 
 
@@ -202,7 +200,7 @@ def separation_correlation(displacement: Displacement) -> Float64Array:
     """
     w, counts = displacement.blocks, displacement.counts
     known = np.where(counts[..., None], w, np.nan)
-    variance = max(float(np.nanmean(known**2)), _TINY) if counts.any() else 1.0
+    variance = max(float(np.nanmean(known**2)), ROUNDING**2) if counts.any() else 1.0
     rows, columns = counts.shape
     found = []
     for k in range(min(rows, columns)):
@@ -228,7 +226,7 @@ def _window(energy: FloatArray, side: int, counts: NDArray[np.bool_]) -> float:
     if not counts.any():
         return float(side)
     variance = 0.0
-    total = np.maximum(block_means(energy, side).astype(np.float64), _TINY)
+    total = np.maximum(block_means(energy, side).astype(np.float64), ROUNDING**2)
     for axis in range(2):
         # Counted from the middle, where single precision is best.
         place = (np.indices(energy.shape)[axis] - energy.shape[axis] / 2).astype(np.float32)

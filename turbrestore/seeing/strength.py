@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arrays import FloatArray
+from ..core.arrays import ROUNDING, FloatArray
 from ..core.noise import estimate_noise
 from ..io.source import Window
 from ..registration.centroid import Centroid
@@ -336,7 +336,7 @@ def _by_blur(mean: FloatArray, image: FloatArray, noise: float) -> Estimate | No
     height, width = image.shape[:2]
     rows, columns = (slice(max(side - _COMPARED, 0) // 2, None) for side in (height, width))
     one, other = (part[rows, columns][:_COMPARED, :_COMPARED] for part in (mean, image))
-    blur = relative_blur(one, other, max(noise, 1e-6))
+    blur = relative_blur(one, other, noise)
     if not np.isfinite(blur.deviation):
         return None
     value = max(blur.variance, 0.0)
@@ -357,7 +357,7 @@ def _wind(w: Float64Array, whole: MotionStatistics, noise_variance: float) -> tu
     change = np.diff(w, axis=0).reshape(-1, 2)
     values, vectors = np.linalg.eigh(change.T @ change / len(change))
     # The noise of both frames is in the change.
-    values = np.maximum(values - 2 * noise_variance, 1e-12)
+    values = np.maximum(values - 2 * noise_variance, ROUNDING**2)
     ratio = float(values[1] / values[0])
     # Each of the two variances has half of the degrees of freedom, and an error of sqrt(2 / that).
     factor = float(np.exp(_DEVIATIONS * np.sqrt(8 / max(whole.freedom, 1.0))))

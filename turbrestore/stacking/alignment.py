@@ -31,7 +31,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, luminance
+from ..core.arrays import ROUNDING, FloatArray, luminance
 from ..core.errors import DataError
 from ..registration.camera.global_shift import correlation, measure_shift, prepare_shift_reference
 from ..registration.camera.stabilisation import find_similarity
@@ -173,9 +173,7 @@ def _described(F: FloatArray, likeness: float) -> Alignment:
 
 def _equally_sharp(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Bring both images to a range of 1, and blur them until both have the same share of fine detail."""
-    a, b = (
-        cv2.GaussianBlur(image / np.float32(max(float(np.ptp(image)), 1e-6)), (0, 0), _LEAST_BLUR) for image in (a, b)
-    )
+    a, b = (cv2.GaussianBlur(_at_unit_range(image), (0, 0), _LEAST_BLUR) for image in (a, b))
     sharper, other = (a, b) if _fineness(a) > _fineness(b) else (b, a)
     wanted = _fineness(other)
     tried = [sharper, *(cv2.GaussianBlur(sharper, (0, 0), blur) for blur in _BLURS[1:])]
@@ -186,12 +184,16 @@ def _equally_sharp(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray
 def _fineness(image: FloatArray) -> float:
     """Energy of the second derivative over that of the first: the squared frequency that carries the gradient."""
     gradient = sum(float(np.square(cv2.Sobel(image, cv2.CV_32F, *axis)).mean()) for axis in ((1, 0), (0, 1)))
-    return float(np.square(cv2.Laplacian(image, cv2.CV_32F)).mean()) / max(gradient, 1e-12)
+    return float(np.square(cv2.Laplacian(image, cv2.CV_32F)).mean()) / max(gradient, ROUNDING**2)
+
+
+def _at_unit_range(image: FloatArray) -> FloatArray:
+    return image / np.float32(max(float(np.ptp(image)), ROUNDING))
 
 
 def _levels(image: FloatArray) -> FloatArray:
     """Deviation from the local mean in units of the local spread."""
-    image = image / np.float32(max(float(np.ptp(image)), 1e-6))
+    image = _at_unit_range(image)
     centred = image - cv2.GaussianBlur(image, (0, 0), _WINDOW)
     return centred / np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), _WINDOW) + np.float32(_FLOOR**2))
 

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from ..agreement.last_guard import keep_agreed
 from ..blind.remove_blur import guarded_steps
 from ..blur.psf import GAUSSIAN, blur_otf
-from ..core.arrays import FloatArray, luminance
+from ..core.arrays import ROUNDING, FloatArray, luminance
 from ..core.decision import Decision
 from ..deconvolution.deconvolve import Deconvolution, deconvolve_steps
 from ..deconvolution.stopping import Steps
@@ -105,7 +105,7 @@ def fuse_finely(
         return sums, held
 
     sums, held = sum_in_threads(add, enumerate(frames), threads)
-    held = np.maximum(held, 1e-12)
+    held = np.maximum(held, ROUNDING**2)
     return Halves(*((total.T / some.T).T.astype(np.float32) for total, some in zip(sums, held, strict=True)))
 
 

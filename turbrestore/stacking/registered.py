@@ -107,9 +107,7 @@ def registered_frames(
 
     def finish(pair: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, float]:
         frame, flow = pair
-        image = prepared.levels.original(warp(frame, flow))
-        for kept in (prepared.title, prepared.bars):
-            image = image if kept is None else kept.put_back(image)
+        image = prepared.put_back(prepared.levels.original(warp(frame, flow)))
         return image, float(frame_quality([prepared.levels.original(frame)])[0])
 
     start = prepared.levels.stretched(restoration.centroid.image)

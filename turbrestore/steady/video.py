@@ -26,7 +26,7 @@ from ..blur.psf import KOLMOGOROV
 from ..core.arrays import FloatArray, luminance
 from ..core.noise import estimate_noise
 from ..core.noise_spectrum import white_noise
-from ..footage.overlays import Title, without_overlay
+from ..footage.overlays import Title, find_title
 from ..footage.survey import take_survey
 from ..io.source import FrameSource
 from ..registration.warp import sample_linear, warp
@@ -210,7 +210,7 @@ class _Scenes:
         clip = FrameSource(
             "stream", "array", shape, 1, 8, lambda chosen: (np.clip(luminance(images[k]), 0, 1) for k in chosen)
         )
-        self._title = without_overlay(take_survey(clip), titles_only=True)[2]
+        self._title = find_title(take_survey(clip))
 
     def estimate(self, frame: DewarpedFrame) -> tuple[Memory, NDArray[np.bool_], float, Title | None]:
         """Estimate of the scene at a frame, what moves, the width of the blur of what is remembered, and the title."""

@@ -16,6 +16,7 @@ from ...core.arrays import luminance
 from ...core.decision import Decision
 from ...core.robust import spread
 from ...core.verdict import CheckKind
+from ..correction import Correction
 from ..survey import Survey
 
 # Components that are looked at, and most frames that they are found from.
@@ -28,8 +29,8 @@ _TWO, _LARGEST, _MOST, _GRID = 0.96, 0.25, 0.9, 16
 _LEAST = 0.25
 
 
-def find_two_states(survey: Survey) -> tuple[Decision, ...]:
-    """Say which frames show either state, if a part of the scene has two."""
+def find_two_states(survey: Survey) -> Correction | None:
+    """Say which frames show either state, if a part of the scene has two; frames stay as they are."""
     frames = luminance(survey.small)
     count = len(frames)
     mean = frames.mean(axis=0)
@@ -44,8 +45,8 @@ def find_two_states(survey: Survey) -> tuple[Decision, ...]:
         second = _second_state(np.array([np.vdot(frame - mean, shape) for frame in frames]))
         part = _part(shape.reshape(mean.shape))
         if second is not None and part <= _LARGEST:
-            return (_in_words(np.asarray(survey.clip.numbers), second, part),)
-    return ()
+            return Correction((_in_words(np.asarray(survey.clip.numbers), second, part),))
+    return None
 
 
 def _second_state(values: NDArray[np.float64]) -> NDArray[np.bool_] | None:

@@ -18,11 +18,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.arrays import FloatArray, luminance
+from ...core.arrays import ROUNDING, FloatArray, luminance
 from ...core.decision import Decision
 from ...core.robust import bisquare_weights, robust_scale
 from ...io.source import Window
 from ...registration.camera.global_shift import DEAD_ZONE, ShiftReference, measure_shift, prepare_shift_reference
+from ..correction import Correction
 from ..survey import Survey
 from .shadows import measure_shade
 
@@ -70,11 +71,11 @@ class Light:
         return steady
 
 
-def steady_light(survey: Survey) -> tuple[Survey, tuple[Decision, ...]]:
-    """Take changes of the light out of the frames; frames whose light is steady are returned as they are."""
+def find_light(survey: Survey) -> Correction | None:
+    """Find changes of the light: of whole frames and along their rows, and then in places."""
     if len(survey.small) < 2:
-        return survey, ()
-    frames, numbers = _reduced_frames(survey), survey.clip.numbers
+        return None
+    frames, numbers, small = _reduced_frames(survey), survey.clip.numbers, None
     light, on_light = _measure_light(survey, frames)
     if light is not None:
         small = np.empty_like(survey.small)
@@ -82,10 +83,14 @@ def steady_light(survey: Survey) -> tuple[Survey, tuple[Decision, ...]]:
             rows, columns = (slice(0, length) for length in before.shape[1:3])
             for number, frame, lit in zip(numbers, before, after, strict=True):
                 lit[...] = replace(light, rows=rows).steady(number, frame, (rows, columns))
-        survey = survey.adjusted(light.steady, small)
     shade, on_shade = measure_shade(frames, numbers, survey.clip.window, _blur_of(survey))
+
+    def apply(number: int, values: FloatArray, window: Window) -> FloatArray:
+        values = values if light is None else light.steady(number, values, window)
+        return values if shade is None else shade.lit(number, values, window)
+
     # From here on the reduced frames only serve to measure shifts of the camera, which shadows hardly change.
-    return survey if shade is None else survey.adjusted(shade.lit), (*on_light, *on_shade)
+    return None if light is None and shade is None else Correction((*on_light, *on_shade), apply, small)
 
 
 def _measure_light(survey: Survey, frames: FloatArray) -> tuple[Light | None, tuple[Decision, ...]]:
@@ -184,11 +189,11 @@ def _blur_of(survey: Survey) -> float:
 def _hardly_change(frames: FloatArray) -> tuple[bool, bool]:
     """Whether level and contrast of the frames hardly change, and whether their rows do."""
     mean, rows, contrasts = frames.mean(axis=0), frames.mean(axis=2), frames.std(axis=(1, 2))
-    level = float(np.sqrt(np.mean(mean**2))) / max(float(mean.std()), 1e-9)
-    gains = rows / np.maximum(rows.mean(axis=0), 1e-6)
+    level = float(np.sqrt(np.mean(mean**2))) / max(float(mean.std()), ROUNDING)
+    gains = rows / np.maximum(rows.mean(axis=0), ROUNDING)
     extent = gains.mean(axis=1)
     bands = float((gains - extent[:, None]).std())
-    changes = max(float(extent.std()) * level, float(contrasts.std()) / max(float(contrasts.mean()), 1e-9))
+    changes = max(float(extent.std()) * level, float(contrasts.std()) / max(float(contrasts.mean()), ROUNDING))
     return changes < _CLEARLY * _LEAST_CHANGE, bands * level < _CLEARLY * _LEAST_BANDS
 
 
@@ -204,7 +209,7 @@ def _reference_of(frames: FloatArray) -> FloatArray | None:
         if placed is None:
             continue
         seen = np.isfinite(placed)
-        gain = float(placed[seen].mean()) / max(float(first[seen].mean()), 1e-6) if seen.any() else 0.0
+        gain = float(placed[seen].mean()) / max(float(first[seen].mean()), ROUNDING) if seen.any() else 0.0
         if gain > 0:
             total[seen] += placed[seen] / gain
             count[seen] += 1
@@ -227,14 +232,14 @@ def _fit_frame(frame: FloatArray, reference: FloatArray, anchor: ShiftReference)
     rows, by_rows = _weighted_fit(values, truth, known, basis)
     affine, affinely = _affine_fit(values, truth, known)
     shown = truth[known]
-    level = float(np.sqrt(np.mean(shown**2))) / max(float(shown.std()), 1e-9) if shown.size else 0.0
+    level = float(np.sqrt(np.mean(shown**2))) / max(float(shown.std()), ROUNDING) if shown.size else 0.0
     return _Fit(
         float(plain[0]), rows, affine, (still, plainly, by_rows, affinely), level, shown.size > 0 and plain[0] > 0
     )
 
 
 def _at_unit_contrast(image: FloatArray) -> FloatArray:
-    return ((image - image.mean()) / max(float(image.std()), 1e-9)).astype(np.float32)
+    return ((image - image.mean()) / max(float(image.std()), ROUNDING)).astype(np.float32)
 
 
 def _placed(frame: FloatArray, anchor: ShiftReference) -> tuple[FloatArray | None, NDArray[np.float64]]:
@@ -266,7 +271,7 @@ def _weighted_fit(
     for _ in range(_ROUNDS):
         power = (weights * truth * truth).sum(axis=1)
         normal = basis.T @ (power[:, None] * basis)
-        normal += np.diag(_SMOOTHNESS * power.sum() * np.arange(basis.shape[1]) ** 2 + 1e-12)
+        normal += np.diag(_SMOOTHNESS * power.sum() * np.arange(basis.shape[1]) ** 2 + ROUNDING**2)
         coefficients = np.linalg.solve(normal, basis.T @ (weights * truth * values).sum(axis=1))
         weights, residual = _reweighted(values - truth * (basis @ coefficients)[:, None], known)
     return coefficients, residual
@@ -277,10 +282,10 @@ def _affine_fit(values: FloatArray, truth: FloatArray, known: NDArray[np.bool_])
     weights = known.astype(np.float64)
     gain, offset, residual = 1.0, 0.0, 0.0
     for _ in range(_ROUNDS):
-        total = max(float(weights.sum()), 1e-12)
+        total = max(float(weights.sum()), ROUNDING**2)
         means = float((weights * truth).sum()) / total, float((weights * values).sum()) / total
         spread = float((weights * (truth - means[0]) ** 2).sum())
-        gain = float((weights * (truth - means[0]) * (values - means[1])).sum()) / max(spread, 1e-12)
+        gain = float((weights * (truth - means[0]) * (values - means[1])).sum()) / max(spread, ROUNDING**2)
         offset = means[1] - gain * means[0]
         weights, residual = _reweighted(values - gain * truth - offset, known)
     return (gain, offset), residual
@@ -288,5 +293,5 @@ def _affine_fit(values: FloatArray, truth: FloatArray, known: NDArray[np.bool_])
 
 def _reweighted(difference: NDArray[np.float64], known: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:
     """Tukey's weights of residuals, and their mean square under these weights."""
-    weights = known * bisquare_weights(difference, robust_scale(difference[known]), 1e-9)
-    return weights, float((weights * difference**2).sum() / max(float(weights.sum()), 1e-12))
+    weights = known * bisquare_weights(difference, robust_scale(difference[known]))
+    return weights, float((weights * difference**2).sum() / max(float(weights.sum()), ROUNDING**2))

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.arrays import FloatArray
+from ...core.arrays import ROUNDING, FloatArray
 from ...core.decision import Decision
 from ...core.robust import bisquare_weights, robust_scale
 from ...core.thresholds import threshold
@@ -95,7 +95,7 @@ def measure_shade(
     change = float(np.percentile(logarithms.std(axis=0), _LIMITS.percentile))
     if change < _LIMITS.change or explained[1] > (1 - _LIMITS.explained) * explained[0]:
         return None, ()
-    shifts = known_shifts(frames / max(float(frames.std()), 1e-6))[0]
+    shifts = known_shifts(frames / max(float(frames.std()), ROUNDING))[0]
     if float(np.square(shifts - shifts.mean(axis=0)).sum(axis=1).mean()) > _LIMITS.static**2:
         return None, ()
     gains = np.exp(logarithms).astype(np.float16)
@@ -110,10 +110,10 @@ def _field(f: FloatArray, r: FloatArray, reach: float) -> tuple[FloatArray, NDAr
     weights, field = np.ones_like(f), np.ones_like(f)
     for _ in range(_LIMITS.rounds):
         over, under = (cv2.GaussianBlur(weights * r * part, (0, 0), reach) for part in (f, r))
-        known = under > 1e-9
+        known = under > ROUNDING**2
         field = np.where(known, over / np.where(known, under, 1), 1).astype(np.float32)
         field = np.clip(field, 1 / _LIMITS.largest, _LIMITS.largest)
         residual = f - field * r
-        weights = bisquare_weights(residual, robust_scale(residual), 1e-6).astype(np.float32) + 1e-3
+        weights = bisquare_weights(residual, robust_scale(residual)).astype(np.float32) + 1e-3
     squares = [float((weights * part**2).sum()) for part in (f - r, residual)]
     return field, np.array(squares)

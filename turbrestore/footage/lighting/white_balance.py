@@ -18,11 +18,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...core.arrays import FloatArray, luminance
+from ...core.arrays import ROUNDING, FloatArray, luminance
 from ...core.decision import Decision
 from ...core.robust import bisquare_weights, robust_scale
 from ...core.thresholds import threshold
 from ...registration.camera.global_shift import known_shifts
+from ..correction import Correction
 from ..placement import reduce_frames
 from ..survey import Survey
 
@@ -43,14 +44,14 @@ class _Thresholds:
 _LIMITS = _Thresholds()
 
 
-def steady_white_balance(survey: Survey) -> tuple[Survey, tuple[Decision, ...]]:
-    """Take a white balance that changes out of the frames; others, and grey frames, are returned as they are."""
+def find_white_balance(survey: Survey) -> Correction | None:
+    """Find a white balance that changes; grey frames have none."""
     if survey.small.ndim != 4 or len(survey.small) < 3:
-        return survey, ()
+        return None
     ratios = _ratios(reduce_frames(survey.small, survey.small.shape, _LIMITS.side, 1, _LIMITS.blur))
     changes = ratios.std(axis=0)
     if changes.max() < _LIMITS.change:
-        return survey, ()
+        return None
     factors = np.exp(ratios).astype(np.float32)
     balance = dict(zip(survey.clip.numbers, factors, strict=True))
     name = ("red", "green", "blue")[int(changes.argmax())]
@@ -58,13 +59,13 @@ def steady_white_balance(survey: Survey) -> tuple[Survey, tuple[Decision, ...]]:
     reason = f"{name} varies from {low:.2f} to {high:.2f} of its mean against the other colours"
     decision = Decision("white balance", "colours of each frame evened out", reason)
     small = survey.small / factors[:, None, None]
-    return survey.adjusted(lambda number, values, _: values / balance[number], small), (decision,)
+    return Correction((decision,), lambda number, values, _: values / balance[number], small)
 
 
 def _ratios(frames: FloatArray) -> NDArray[np.float64]:
     """Logarithms of the gains of channels over that of luminance, (T, 3), of mean 0 over time."""
     grey = np.stack([luminance(frame) for frame in frames])
-    shifts = known_shifts(grey / np.maximum(grey.mean(axis=(1, 2), keepdims=True), 1e-6) / 4)[0]
+    shifts = known_shifts(grey / np.maximum(grey.mean(axis=(1, 2), keepdims=True), ROUNDING) / 4)[0]
     planes = np.concatenate([frames, grey[..., None]], axis=-1)
     size = planes.shape[2], planes.shape[1]
     # Every frame at the place of the first; NaN beyond its border.
@@ -99,7 +100,7 @@ def _gain(values: FloatArray, reference: NDArray[np.float64], usable: NDArray[np
     weights: NDArray[np.floating] = np.ones(f.size)
     gain = 1.0
     for _ in range(_LIMITS.rounds):
-        gain = float((weights * r * f).sum() / max(float((weights * r * r).sum()), 1e-12))
+        gain = float((weights * r * f).sum() / max(float((weights * r * r).sum()), ROUNDING**2))
         residual = f - gain * r
-        weights = bisquare_weights(residual, robust_scale(residual), 1e-9)
-    return max(gain, 1e-3)
+        weights = bisquare_weights(residual, robust_scale(residual))
+    return max(gain, ROUNDING)

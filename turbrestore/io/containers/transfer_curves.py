@@ -20,6 +20,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ...core.arrays import ROUNDING
 from ..pixels import PixelArray
 
 # Numbers of transfer characteristics and primaries in ITU-T H.273.
@@ -43,10 +44,10 @@ def sdr_of(transfer: int) -> Callable[[PixelArray], PixelArray]:
         light = table[codes]
         if transfer == HLG:
             # The system gamma acts on luminance; white of the scene is that of the display.
-            luminance = np.maximum(light @ _LUMINANCE_2020, 1e-6)
+            luminance = np.maximum(light @ _LUMINANCE_2020, ROUNDING)
             light *= (_PEAK * luminance**0.2)[..., None]
         light = np.maximum(light @ _TO_BT709.T, 0)
-        brightest = np.maximum(light.max(axis=-1, keepdims=True), 1e-6)
+        brightest = np.maximum(light.max(axis=-1, keepdims=True), ROUNDING)
         light *= _rolled_off(brightest) / brightest
         return np.rint(65535 * np.minimum(light, 1) ** np.float32(1 / _GAMMA)).astype(np.uint16)
 
