@@ -200,9 +200,9 @@ def _peak(shape: tuple[int, ...], params: RestoreParams, choice: _Choice, budget
     frames, flows, modes = _stack(part, params, train)
     if choice.in_scratch:
         in_hand = (2 * threads + 2) / train
-        frames, flows, modes = frames * in_hand, flows * in_hand, min(modes, 4.0 * _MODE_ELEMENTS_PER_THREAD * threads)
+        frames, flows, modes = frames * in_hand, flows * in_hand, min(modes, 4 * _MODE_ELEMENTS_PER_THREAD * threads)
     # The sum of the frames; in tiles the frame that is being read, while the other images of the whole lie in files.
-    held = frames + flows + (8.0 if choice.tile is None else 10.5) * _pixels(shape) * _channels(shape)
+    held = frames + flows + (8 if choice.tile is None else 10.5) * _pixels(shape) * _channels(shape)
     flow, side = flow_memory(part, threads), _deconvolution_side(shape, params, choice, budget)
     results = _held_by_deconvolution(shape, params, choice)
     prepared = _pixels(shape) * float(_PREPARED + _PREPARED_COLOUR * _channels(shape))
@@ -223,8 +223,8 @@ def _peak(shape: tuple[int, ...], params: RestoreParams, choice: _Choice, budget
 def _on_finer_grid(shape: tuple[int, ...], params: RestoreParams, threads: int) -> float:
     """Bytes of the sums of two halves, which every thread has too, and of the deconvolution there."""
     side = round(params.scale * shape[1]), round(params.scale * shape[2]), *shape[3:]
-    sums = side[0] * side[1] * 16.0 * (_channels(shape) + 1) * (threads + 2)
-    return max(sums, remove_blur_memory(side, params.deconvolution) + 8.0 * side[0] * side[1] * _channels(shape))
+    sums = side[0] * side[1] * 16 * (_channels(shape) + 1) * (threads + 2)
+    return max(sums, remove_blur_memory(side, params.deconvolution) + 8 * side[0] * side[1] * _channels(shape))
 
 
 def _deconvolution_side(shape: tuple[int, ...], params: RestoreParams, choice: _Choice, budget: float) -> int | None:
@@ -248,7 +248,7 @@ def _stack(shape: tuple[int, ...], params: RestoreParams, train: int) -> tuple[f
     """Bytes of the training frames, of their flows and of the modes of the flow model."""
     pixels = _pixels(shape)
     modes = modes_memory(shape, train, params.dynamics) if params.runs("identify") else 0.0
-    return 4.0 * train * pixels * _channels(shape), 8.0 * train * pixels, modes
+    return 4 * train * pixels * _channels(shape), 8 * train * pixels, modes
 
 
 def _held_by_deconvolution(shape: tuple[int, ...], params: RestoreParams, choice: _Choice) -> float:
@@ -265,11 +265,11 @@ def _kept_halves(shape: tuple[int, ...], params: RestoreParams) -> float:
 
 
 def _scratch_bytes(shape: tuple[int, ...], params: RestoreParams, choice: _Choice) -> int:
-    size = sum(_stack(shape, params, choice.train)) + 16.0 * _pixels(shape)
+    size = sum(_stack(shape, params, choice.train)) + 16 * _pixels(shape)
     if choice.tile is not None:
         part = shape[0], *largest_tile((shape[1], shape[2]), choice.tile), *shape[3:]
         # A tile has copies of its frames and flows and a model of its own; tiles of the images overlap up to fourfold.
-        size += sum(_stack(part, params, choice.train)) + 4.0 * _pixels(shape) * (6 + 14 * _channels(shape))
+        size += sum(_stack(part, params, choice.train)) + 4 * _pixels(shape) * (6 + 14 * _channels(shape))
     return int(max(size, survey_scratch_bytes(shape)))
 
 

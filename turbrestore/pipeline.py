@@ -28,7 +28,7 @@ from .io.source import FrameSource
 from .memory_plan import plan_memory
 from .preparation import prepare
 from .registration.centroid import Centroid
-from .registration.coverage import Rectangle, coverage, well_seen
+from .registration.coverage import SEEN, Rectangle, coverage, well_seen
 from .registration.flow import MIN_SIDE
 from .registration.recentring import recentre
 from .results import Restoration, Store
@@ -51,8 +51,6 @@ from .wording import (
     explain_seeing,
 )
 
-# Every border pixel of a cropped image is visible in at least this share of the training frames.
-_SEEN = 0.9
 # A pixel that fewer frames show is about as noisy as in one of them.
 _FEW_FRAMES = 4
 
@@ -298,7 +296,7 @@ def _find_crop(
         return whole, explain_border(float(seen.min()), None)
     # Part of the light of pixels within one width of the blur from the border fell outside the frames.
     sigma = 0.0 if deblurred is None else deblurred.deconvolution.sigma
-    crop = well_seen(seen, _SEEN, int(np.ceil(sigma)), MIN_SIDE)
+    crop = well_seen(seen, SEEN, int(np.ceil(sigma)), MIN_SIDE)
     return crop, explain_border(float(seen.min()), None if crop == whole else crop)
 
 

@@ -41,7 +41,7 @@ Result = TypeVar("Result")
 # Blur that pixels and interpolation have by themselves, and error of the geometry that is seen, pixels.
 _SEEN_BLUR, _SEEN_BEND = 0.5, 1.0
 # Frames whose halves are too few to tell what they agree on.
-_FEW = 8
+FEW = 8
 # Share of the image that is worth a look; most of something.
 _UNSEEN, _HALF = 0.01, 0.5
 # Factor by which a width may be off; ``benchmarks/verdicts.py`` lists what more costs.
@@ -241,8 +241,8 @@ def _checks(restoration: Restoration, motion: float) -> Iterator[Check]:
     if period < 2 * largest:
         yield write_check(CheckKind.REPETITION, period, largest)
     error = of_air * mean_flow_error(restoration.dynamics, int(np.isfinite(filtered.sharpness).sum()))
-    if restoration.frame_count < _FEW:
-        yield write_check(CheckKind.FEW_FRAMES, counted(restoration.frame_count, "frame"), error, _FEW)
+    if restoration.frame_count < FEW:
+        yield write_check(CheckKind.FEW_FRAMES, counted(restoration.frame_count, "frame"), error, FEW)
     elif error > _SEEN_BEND:
         yield write_check(CheckKind.GEOMETRY, error, counted(restoration.frame_count, "frame"))
     if structure is not None and structure.left > _HALF:

@@ -53,7 +53,7 @@ def test_a_large_image_in_parts_is_the_same(shape, tmp_path, monkeypatch):
     image = np.random.default_rng(0).random(shape, dtype=np.float32)
     grey, levels = luminance(image), from_unit(image, 12)
     assert np.array_equal(levels, np.rint(image * np.float64(4095)))
-    monkeypatch.setattr("turbrestore.core.arrays._PART", 500)
+    monkeypatch.setattr("turbrestore.core.arrays.PART", 500)
     for kept in (image, to_scratch(image, tmp_path)):
         assert np.array_equal(luminance(kept), grey)
         assert np.array_equal(from_unit(kept, 12), levels)

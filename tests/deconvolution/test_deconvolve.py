@@ -186,7 +186,7 @@ def test_a_deconvolution_that_is_left_early_ends_its_threads():
 @pytest.mark.parametrize("method", METHODS)
 def test_the_same_bytes_whatever_the_number_of_threads(monkeypatch, method):
     for place in ("deconvolve", "nonlocal_prior.nonlocal_tv", "problem"):
-        monkeypatch.setattr(f"turbrestore.deconvolution.{place}._PARALLEL_PIXELS", 1)
+        monkeypatch.setattr(f"turbrestore.deconvolution.{place}.PARALLEL_PIXELS", 1)
     _, blurred = camera(72, 1.5, 0.002)
     params, guide = DeconvolutionParams(method=method, iterations=10), blurred[::-1]
     images = [deconvolve(blurred, 1.5, params, guide, Runtime(threads=threads)).image for threads in (1, 2, 5)]

@@ -48,7 +48,7 @@ def test_ascent_is_a_relaxed_projection(graph, relaxation):
 
 def test_threads_change_nothing(graph, monkeypatch):
     image, found = np.random.default_rng(3).normal(size=graph.shape).astype(np.float32), []
-    monkeypatch.setattr(nonlocal_tv, "_PARALLEL_PIXELS", 1)
+    monkeypatch.setattr(nonlocal_tv, "PARALLEL_PIXELS", 1)
     for workers in (1, 2, 4):
         with ThreadTeam(workers) as team:
             penalty = NonlocalPenalty(graph, team)

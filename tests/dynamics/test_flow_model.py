@@ -84,7 +84,7 @@ def test_a_state_is_the_same_from_a_file_and_piece_by_piece(rng, tmp_path, monke
     mapped[:] = whole.C
     deviation = flows[3] - whole.mean_flow
     at_once = project_deviation(whole, deviation)
-    monkeypatch.setattr("turbrestore.dynamics.flow_model.PIECE", 70)
+    monkeypatch.setattr("turbrestore.dynamics.flow_model.PART", 70)
     kept, filed = (project_deviation(model, deviation) for model in (whole, replace(whole, C=mapped)))
     np.testing.assert_array_equal(kept, filed)
     np.testing.assert_allclose(kept, at_once, atol=1e-5)

@@ -230,7 +230,7 @@ def test_odd_headers_are_refused(tmp_path, header):
 def test_mapped_arrays_are_written_part_by_part_as_numpy_writes_them(tmp_path, monkeypatch, view):
     stack = new_stack((5, 6, 7), tmp_path)
     stack[...] = np.arange(210).reshape(5, 6, 7)
-    monkeypatch.setattr("turbrestore.runtime.scratch._PART", 20)
+    monkeypatch.setattr("turbrestore.runtime.scratch.PART", 20)
     largest = []
     monkeypatch.setattr("turbrestore.runtime.scratch.drop_pages", lambda part: largest.append(part.size))
     with (tmp_path / "a.npz").open("wb") as stream:

@@ -227,8 +227,8 @@ def test_a_restoration_is_the_same_bytes_whatever_the_number_of_threads(monkeypa
     # Several strips and several sums of everything.
     monkeypatch.setattr("turbrestore.registration.warp._STRIP", 1000)
     monkeypatch.setattr("turbrestore.dynamics.dynamic_texture._STRIP_BYTES", 1 << 16)
-    monkeypatch.setattr("turbrestore.deconvolution.deconvolve._PARALLEL_PIXELS", 0)
-    monkeypatch.setattr("turbrestore.deconvolution.nonlocal_prior.nonlocal_tv._PARALLEL_PIXELS", 0)
+    monkeypatch.setattr("turbrestore.deconvolution.deconvolve.PARALLEL_PIXELS", 0)
+    monkeypatch.setattr("turbrestore.deconvolution.nonlocal_prior.nonlocal_tv.PARALLEL_PIXELS", 0)
     frames = make_sequence(seed=3, count=16).frames[:, :64, :80]
 
     def run(threads):

@@ -56,7 +56,7 @@ def compare_with_memory(folder, shape, seed, patch):
     assert isinstance(mapped, np.memmap)
     assert np.array_equal(mapped, values)
     for stack, part in itertools.product((values, mapped), (3, 1 << 22)):
-        patch.setattr("turbrestore.runtime.scratch._PART", part)
+        patch.setattr("turbrestore.runtime.scratch.PART", part)
         assert np.array_equal(mean_of(stack), values.mean(axis=0, dtype=np.float32))
         assert np.allclose(variance_of(stack), values.var(axis=0), atol=1e-5)
         assert np.array_equal(np.concatenate(list(iter_parts(stack))), values)

@@ -44,7 +44,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..blur.edges import edge_profiles, fewer_edges, find_edges, largest_fall
-from ..core.arrays import FloatArray, check_image, luminance
+from ..core.arrays import ROUNDING, FloatArray, check_image, luminance
 from ..core.errors import DataError, require_between
 from ..core.noise import estimate_noise
 from ..runtime.scratch import iter_parts
@@ -60,12 +60,12 @@ _CLIPPED, _LEAST_SHARE = 0.05, 0.01
 # Standard deviation of the Gaussian that separates fine detail, pixels.
 _DETAIL_WINDOW = 4.0
 _LEAST_DEVIATION = 1e-4
-# Slight excess over a bound, as a factor, and the least bound that it is a factor of.
-_SLIGHT, _LEAST_BOUND = 1.5, 1e-6
+# Slight excess over a bound, as a factor.
+_SLIGHT = 1.5
 # Widest blur whose ringing is judged, pixels: behind a wider one, profiles of four widths cross the next letter.
 WIDEST_RINGS = 3.0
-# Distance up to which edges are followed: widths of the blur, and pixels.
-_REACH_SIGMAS, _SMALLEST_REACH = 4.0, 6
+# Distance up to which edges are followed at least, pixels.
+_SMALLEST_REACH = 6
 # Distance within which the step of an edge ends, in widths of the blur and in pixels.
 _STEP_SIGMAS, _SMALLEST_STEP = 2.5, 3
 # Steps count from this multiple of the noise, and from this share of the steps of most edges.
@@ -115,8 +115,8 @@ class GuardParams:
     def first_back_off(self, reading: GuardReading) -> float:
         """Return the factor on the width after the first attempt, if that failed."""
         excess = max(
-            reading.ringing / max(self.ringing, _LEAST_BOUND),
-            reading.overshoot / max(self.overshoot, _LEAST_BOUND),
+            reading.ringing / max(self.ringing, ROUNDING),
+            reading.overshoot / max(self.overshoot, ROUNDING),
             reading.noise_gain / self.noise_gain,
         )
         return self.back_off**0.5 if excess <= _SLIGHT else self.back_off
@@ -196,7 +196,7 @@ def _noise_gain(after: FloatArray, before: FloatArray) -> float:
 
 def ringing(after: FloatArray, before: FloatArray, sigma: float) -> float:
     """Return the share of strong edges along which a deconvolved image (H, W) rings."""
-    reach = max(_SMALLEST_REACH, int(np.ceil(_REACH_SIGMAS * sigma)))
+    reach = max(_SMALLEST_REACH, int(np.ceil(_WINDOW_SIGMAS * sigma)))
     noise = estimate_noise(before)
     edges = fewer_edges(find_edges(before, noise), _SAMPLES // (2 * reach + 1))
     if not len(edges.places):

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import ROUNDING, FloatArray, luminance
-from ..core.gradient import sobel_gradient
+from ..core.gradient import gradient_noise, sobel_gradient
 from ..core.noise import estimate_noise
 from ..core.robust import spread
 from ..registration.warp import inside, warp
@@ -41,9 +41,8 @@ UNSEEN, LEFT = 0.1, 0.3
 LASTING = 0.1
 # Standard deviation of the Gaussian before a gradient is taken, pixels.
 _SCALE = 2.0
-# Edges of f have at least this share of its steepest gradients, and exceed the noise of a frame by this factor; the
-# deviation of the gradient of white noise at the scale of frames.
-_EDGE, _CLEAR, _GRADIENT_NOISE = 0.1, 6.0, 0.05
+# Edges of f have at least this share of its steepest gradients, and exceed that of the noise of a frame by this factor.
+_EDGE, _CLEAR = 0.1, 6.0
 # Cosine of the angle within which gradients have one direction.
 _ALIKE = 0.7
 # Percentile of the gradients that is taken for the steepest.
@@ -87,7 +86,7 @@ def compare_structure(
     steepness = np.hypot(*gradient)
     within = _within(steepness.shape)
     steepest = float(np.percentile(steepness[within], _STEEPEST))
-    least = max(_EDGE * steepest, _CLEAR * _GRADIENT_NOISE * estimate_noise(frames[picked[0]]))
+    least = max(_EDGE * steepest, _CLEAR * gradient_noise(_SCALE) * estimate_noise(frames[picked[0]]))
     edges = (steepness > least) & within
     totals = np.zeros(5)
     for window in _windows(edges.shape):

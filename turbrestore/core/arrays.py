@@ -29,7 +29,7 @@ CHANNELS = (3,)
 # Rounding error of float32 at full scale: intensities that differ by less are the same.
 ROUNDING = float(np.finfo(np.float32).eps)
 # Numbers in each part of a large array that is processed in parts.
-_PART = 1 << 22
+PART = 1 << 22
 # Weights of RGB by Rec. 601, as OpenCV and most cameras use them.
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 
@@ -113,7 +113,7 @@ def from_unit_to_type(image: FloatArray, bit_depth: int) -> NDArray[Any]:
 
 def _parts(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
     """Consecutive views along the first axis, each of a few million numbers at most."""
-    step = max(1, len(array) * _PART // max(array.size, 1))
+    step = max(1, len(array) * PART // max(array.size, 1))
     return (array[start : start + step] for start in range(0, len(array), step))
 
 

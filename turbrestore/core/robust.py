@@ -9,8 +9,13 @@ from .arrays import ROUNDING
 
 # Standard deviation of normal numbers in their median absolute one: 1 / Φ⁻¹(3/4).
 MEDIAN_DEVIATION = 1.4826
+# Frames that a median over time is taken of, which then has a quarter of the deviation of one (1.25 / √25), and rows of
+# them that are sorted at once.
+MEDIAN_OF, MEDIAN_ROWS = 25, 64
 # Tukey's constant, in standard deviations: fits by these weights keep 95 % of the efficiency of least squares.
 _TUKEY = 4.685
+# Fits, each with the weights of the residuals of the one before: the first by least squares, and three that settle.
+ROUNDS = 4
 
 
 def robust_scale(residuals: NDArray[np.floating]) -> float:

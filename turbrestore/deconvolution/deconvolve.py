@@ -36,7 +36,7 @@ from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.steps import finish
 from ..runtime.threads import ThreadTeam, one_thread_each
 from .conjugate_gradient import quadratic_solver, wiener_fidelity, wiener_image
-from .nonlocal_prior.nonlocal_tv import NonlocalPenalty
+from .nonlocal_prior.nonlocal_tv import PARALLEL_PIXELS, NonlocalPenalty
 from .nonlocal_prior.nonlocal_weights import NonlocalParams, nonlocal_weights
 from .nonlocal_prior.torch_nonlocal import torch_nonlocal_penalty
 from .primal_dual import Penalty, PrimalDual
@@ -50,9 +50,6 @@ if TYPE_CHECKING:
 METHODS = ("nltv", "tv", "wiener", "tikhonov")
 BOUNDARIES = ("unknown", "periodic")
 CHANNELS = ("luminance", "each")
-
-# Smaller images are sharpened one after another: their transforms take less time than waiting for the interpreter lock.
-_PARALLEL_PIXELS = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -339,7 +336,7 @@ def _sharpened(
     observed, blurred = problems[0].observed, list(problems)
     if guide is not None and params.sharpen_guide and params.method == "nltv":
         blurred.append(dataclasses.replace(problems[0], observed=load(guide, observed.device)))
-    side_by_side = isinstance(observed, np.ndarray) and observed.size >= _PARALLEL_PIXELS
+    side_by_side = isinstance(observed, np.ndarray) and observed.size >= PARALLEL_PIXELS
     sharpen = partial(wiener_image, noise=noise)
     sharp = list(team.map(sharpen, blurred) if side_by_side else map(sharpen, blurred))
     starts, further = sharp[: len(problems)], sharp[len(problems) :]

@@ -41,7 +41,7 @@ MARGIN_SIGMAS = 4.0
 # Largest weight of a pixel, and the inverse of the least.
 _MOST_WEIGHT = 4.0
 # Transforms of smaller images are faster on one thread than on several.
-_PARALLEL_PIXELS = 1 << 20
+PARALLEL_PIXELS = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class Problem:
 
     @property
     def _workers(self) -> int:
-        return self.threads if self.shape[0] * self.shape[1] >= _PARALLEL_PIXELS else 1
+        return self.threads if self.shape[0] * self.shape[1] >= PARALLEL_PIXELS else 1
 
     def blur(self, spectrum: Stack) -> Stack:
         """Image Bu from the transform of u."""

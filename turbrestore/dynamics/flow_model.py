@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import ROUNDING, FloatArray
+from ..core.arrays import PART, ROUNDING, FloatArray
 from ..core.errors import DataError
 from ..display.preview import preview
 from ..display.spectra import plot_dynamics
@@ -35,8 +35,6 @@ Float64Array = NDArray[np.float64]
 
 # Products that are summed in single precision before their sum is added in double; they fit into the first cache.
 SUMMED = 2048
-# Numbers of C that are in memory at a time if it is mapped.
-PIECE = 1 << 22
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +184,7 @@ def project_deviation(dynamics: FlowDynamics, deviation: FloatArray) -> Float64A
     """
     # C is stored column by column.
     modes, flat, state = dynamics.C.T, deviation.reshape(-1), np.zeros(dynamics.C.shape[1])
-    step = SUMMED * max(1, PIECE // (SUMMED * max(1, len(modes))))
+    step = SUMMED * max(1, PART // (SUMMED * max(1, len(modes))))
     for rows in iter_slices(flat.size, step, modes):
         # NumPy's product of a matrix and a vector would keep the interpreter lock.
         add_products(modes, flat, rows.start, rows.stop, state)

@@ -20,6 +20,8 @@ import numpy as np
 from ..core.arrays import ROUNDING, FloatArray, luminance
 from ..core.noise import fit_noise_curve
 from ..core.noise_spectrum import NoiseSpectrum
+from ..core.robust import MEDIAN_DEVIATION, MEDIAN_OF, MEDIAN_ROWS
+from ..core.robust import spread as spread_over
 from ..registration.registered_noise import noise_of_frames
 from ..registration.warp import warp
 from ..runtime.fourier import irfft2, rfft2
@@ -43,9 +45,8 @@ _IMAGE_NOISE_FLOOR = 6e-8
 _LEAST_SPREAD = 0.03
 # Share of the mean variance by which every pixel varies at least.
 _LEAST_DEVIATION = 0.1
-# Frames of which the median is taken, the rows that it is taken of at once, the factor from a median deviation to a
-# standard deviation, and how many times the variance exceeds its robust estimate where an object has moved.
-_RESERVOIR, _ROWS, _MEDIAN_DEVIATION, _HEAVY_TAIL = 25, 64, 1.4826, 4.0
+# How many times the variance exceeds its robust estimate where an object has moved.
+_HEAVY_TAIL = 4.0
 # Variance of a Sobel derivative (divided by 8) of white noise of unit variance, and the pixels over which such
 # derivatives correlate.
 _SOBEL_NOISE, _SOBEL_AREA = 12 / 64, 3.0
@@ -141,7 +142,7 @@ def _median_and_spread(
     frames: Sequence[FloatArray], flows: Sequence[FloatArray], shape: tuple[int, ...], count: int, threads: int
 ) -> tuple[FloatArray, FloatArray, np.ndarray]:
     """Median of some registered frames, their squared median deviation as a variance, and their variance in detail."""
-    picked = set(np.linspace(0, count - 1, min(count, _RESERVOIR)).round().astype(int).tolist())
+    picked = set(spread_over(count, MEDIAN_OF))
     stack = np.empty((len(picked), *shape), np.float16)
     chosen = (
         pair
@@ -154,16 +155,16 @@ def _median_and_spread(
     centre, spread = np.empty(shape, np.float32), np.empty(shape, np.float32)
 
     def fill(top: int) -> None:
-        rows = np.s_[top : top + _ROWS]
+        rows = np.s_[top : top + MEDIAN_ROWS]
         # With the values of a pixel side by side, sorting them takes a fifth of the time of a median over the frames.
         values = np.ascontiguousarray(np.moveaxis(stack[:, rows], 0, -1), np.float32)
         values.sort(axis=-1)
         centre[rows] = _middle(values)
         values -= centre[rows, :, None]
         np.abs(values, out=values).sort(axis=-1)
-        spread[rows] = (_MEDIAN_DEVIATION * _middle(values)) ** 2
+        spread[rows] = (MEDIAN_DEVIATION * _middle(values)) ** 2
 
-    for _ in map_ahead(fill, range(0, shape[0], _ROWS), threads):
+    for _ in map_ahead(fill, range(0, shape[0], MEDIAN_ROWS), threads):
         pass
     fine = np.zeros(shape)
     for plane in stack:

@@ -34,17 +34,16 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
-from ..core.robust import MEDIAN_DEVIATION, spread
+from ..core.robust import MEDIAN_DEVIATION, MEDIAN_OF, MEDIAN_ROWS, spread
 from ..io.source import FrameSource, Window
-from ..registration.camera.global_shift import known_shifts
+from ..registration.camera.global_shift import LONGEST_SIDE, known_shifts
+from ..registration.flow import MIN_SIDE
 from ..registration.flow_methods.opencv_flow import DisParams, dis_solver
 from ..runtime.scratch import iter_frames
 from .correction import Correction
-from .placement import Placement, reduce_frames, relative_window
-from .survey import Survey
+from .placement import Placement, camera_moves, reduce_frames, relative_window
+from .survey import FEWEST, Survey
 
-# Frames of which the median is taken, the fewest that tell objects from the background, and rows of it at a time.
-_SAMPLES, _FEWEST, _ROWS = 25, 9, 64
 # d counts from the first times the sum of v and the square of the second; windows of d and of v, pixels.
 _EXCEEDS, _LEAST_DEVIATION = 8.0, 0.01
 _WINDOW, _VARIANCE_WINDOW = 1.5, 3.0
@@ -65,12 +64,10 @@ _LEAST_SMALL, _ONE_SIDED = 0.06, 0.75
 # Least and largest share of the frames that objects cover, largest part of a frame that is replaced, and fewest frames
 # that show a pixel of the background.
 _LEAST, _LARGEST, _LARGEST_PART, _SEEN = 0.0025, 0.35, 0.5, 3
-# Root mean square of the shifts from which the camera moves, pixels; least share of all edges that the background has.
-_CAMERA, _OWN_EDGES = 3.0, 0.5
+# Least share of all edges that the background has.
+_OWN_EDGES = 0.5
 # Most pixels of what a moving camera shows, in frames, and the share of the variance that following it may leave.
 _LARGEST_SCENE, _FOLLOWED = 4.0, 0.5
-# Longest side of the reduced frames whose shifts are measured.
-_REDUCED_SIDE = 192
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +123,7 @@ def find_moving_objects(survey: Survey) -> Correction | None:
     If there are any, all frames are read once more, because each shows another part of the background.
     """
     source = survey.clip
-    found = _model_background(survey) if len(source) >= _FEWEST else None
+    found = _model_background(survey) if len(source) >= FEWEST else None
     if found is None:
         return None
     model, placement = found
@@ -140,7 +137,7 @@ def find_moving_objects(survey: Survey) -> Correction | None:
 
 def _model_background(survey: Survey) -> tuple[_Model, Placement] | None:
     """Model the background of a clip, and place its frames in it; None if there are no moving objects."""
-    source, places = survey.clip, spread(len(survey.numbers), _SAMPLES)
+    source, places = survey.clip, spread(len(survey.numbers), MEDIAN_OF)
     numbers = tuple(survey.numbers[place] for place in places)
     stack = np.empty((len(places), *source.shape[1:3]), np.uint8)
     sample = map(source.intensities, numbers, iter_frames(map(survey.pixels.__getitem__, places)))
@@ -154,7 +151,7 @@ def _model_background(survey: Survey) -> tuple[_Model, Placement] | None:
         found = _fitted(stack, numbers, _median_model(stack, numbers, still, reach=reach), still)
     if found is not None:
         return found, still
-    if not _moves(_shifts(_reduced(map(_grey, stack), stack.shape), stack.shape)):
+    if not camera_moves(_shifts(_reduced(map(_grey, stack), stack.shape), stack.shape)):
         return None
     # The scene moves through the frames too if the camera does; what moves as most of the frame does is the scene.
     small = luminance(survey.small)
@@ -168,13 +165,9 @@ def _model_background(survey: Survey) -> tuple[_Model, Placement] | None:
     return None if found is None else (found, moving)
 
 
-def _moves(shifts: NDArray[np.float64]) -> bool:
-    return float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) >= _CAMERA
-
-
 def _reduced(frames: Iterable[FloatArray], shape: tuple[int, ...]) -> FloatArray:
     """Reduce and smooth T frames of (H, W) pixels, ``shape`` beginning with (T, H, W), to measure their shifts."""
-    return reduce_frames(frames, shape[:3], _REDUCED_SIDE, 16, 1.0)
+    return reduce_frames(frames, shape[:3], LONGEST_SIDE, MIN_SIDE, 1.0)
 
 
 def _shifts(small: FloatArray, shape: tuple[int, ...]) -> NDArray[np.float64]:
@@ -245,7 +238,7 @@ def _is_scene(
     away = _shifts(left, stack.shape) - shifts
     # Snow has more edges than the scene.
     own = parts[0].excess is not None or bool(edges[1] > _OWN_EDGES * edges[0])
-    return own and not _moves(away - away.mean(axis=0))
+    return own and not camera_moves(away - away.mean(axis=0))
 
 
 def _median_model(
@@ -261,8 +254,8 @@ def _median_model(
     """
     shape, places = placement.shape, [placement.place(number) for number in numbers]
     median, variance, seen = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
-    for top in range(0, shape[0], _ROWS):
-        rows = slice(top, min(top + _ROWS, shape[0]))
+    for top in range(0, shape[0], MEDIAN_ROWS):
+        rows = slice(top, min(top + MEDIAN_ROWS, shape[0]))
         values = np.full((len(stack), rows.stop - top, shape[1]), np.nan, np.float32)
         hidden = np.zeros(values.shape, bool)
         for index, (frame, (down, across)) in enumerate(zip(stack, places, strict=True)):
@@ -272,9 +265,9 @@ def _median_model(
                 part = np.s_[first - down.start : last - down.start]
                 values[shown] = _grey(frame[part])
                 hidden[shown] = False if masks is None else masks[index][part] > 0
-        few = (np.isfinite(values) & ~hidden).sum(axis=0) < _FEWEST
+        few = (np.isfinite(values) & ~hidden).sum(axis=0) < FEWEST
         values[hidden & ~few] = np.nan
-        seen[rows] = np.isfinite(values).sum(axis=0) >= _FEWEST
+        seen[rows] = np.isfinite(values).sum(axis=0) >= FEWEST
         median[rows] = _median(values)
         variance[rows] = (MEDIAN_DEVIATION * _median(np.abs(values - median[rows]))) ** 2
     around = np.ones((2 * reach + 1,) * 2, np.uint8)

@@ -17,7 +17,8 @@ from ..core.errors import ConfigurationError, DataError, require
 
 # Small enough for the detail that turbulence blurs, large enough to suppress pixel noise.
 _SIGMA = 1.5
-_DARK = 1e-3
+# A frame that is darker on average counts as this bright: what it shows is noise.
+DARK = 1e-3
 
 
 class Share(float):
@@ -39,7 +40,7 @@ def frame_quality(frames: Iterable[ArrayLike]) -> np.ndarray:
     for index, frame in enumerate(frames):
         grey = check_grey(frame, f"frame {index}")
         detail = cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), _SIGMA), cv2.CV_32F)
-        quality.append(float(np.mean(np.square(detail))) / max(float(grey.mean()), _DARK) ** 2)
+        quality.append(float(np.mean(np.square(detail))) / max(float(grey.mean()), DARK) ** 2)
     if not quality:
         raise DataError("frames: expected at least 1, found none")
     return np.array(quality)

@@ -51,13 +51,11 @@ from .checks.clocks import (
 )
 from .checks.missing_pixels import continued
 from .correction import Correction
-from .placement import Placement, relative_window
+from .placement import Placement, camera_moves, relative_window
 from .survey import Moments, Survey
 
 # Fewest frames of a clip in which an overlay is looked for.
 FEWEST = 3
-# Root mean square of the shifts of the camera, pixels, from which the scene counts as moving.
-_LEAST_MOTION = 3.0
 # An edge is static if it varies by less than its gradient times this share of the motion of the edges, or one pixel;
 # with a static camera, the edges move by at least so many pixels.
 _STATIC, _LEAST_BENDING = 1 / 3, 0.3
@@ -179,16 +177,11 @@ class _Static:
     title: Title | None = None  # what it is if the camera is static
     digits: NDArray[np.bool_] | None = None  # (H, W): those that change
 
-    @property
-    def moves(self) -> bool:
-        """Whether the camera moves."""
-        return float(np.sqrt(np.mean(np.sum(self.shifts**2, axis=1)))) >= _LEAST_MOTION
-
 
 def find_title(survey: Survey) -> Title | None:
     """Find the title that a static camera has drawn over its frames."""
     found = _find_static(survey)
-    return None if found is None or found.moves else found.title
+    return None if found is None or camera_moves(found.shifts) else found.title
 
 
 def find_overlay(survey: Survey, mask: NDArray[np.bool_] | None = None) -> Correction | None:
@@ -201,7 +194,7 @@ def find_overlay(survey: Survey, mask: NDArray[np.bool_] | None = None) -> Corre
     found = _find_static(survey)
     if found is None:
         return None
-    if found.moves:
+    if camera_moves(found.shifts):
         return _uncovered(survey, found)
     return None if found.title is None else _kept(found.small, found.title)
 

@@ -33,20 +33,16 @@ from ..core.thresholds import threshold
 from ..io.source import Window
 from .correction import Correction
 from .placement import relative_window
-from .survey import Moments, Survey
+from .sensor_pattern import LIMITS as STRIPES
+from .survey import FEWEST, Moments, Survey
 
 
 @dataclass(frozen=True)
 class _Thresholds:
     """What tells a pattern of the sensor from the scene."""
 
-    frames: int = threshold(8, "frames", "chosen: as for stripes of the sensor")
-    motion: float = threshold(0.3, "pixels", "chosen: as for stripes of the sensor")  # least s
     # Least deviation of fine detail of m in that of its noise.
     clear: float = threshold(4.0, "1", "measured: sixty clips without a pattern reach 1.7, patterns 11")
-    # Most that P adds to v, relative to what would move.
-    static: float = threshold(0.25, "1", "chosen: as for stripes of the sensor")
-    steep: float = threshold(0.9, "1", "chosen: quantile of the slopes from which s is measured")
     # Deviations of P beyond which a pixel is of an overlay.
     outlier: float = threshold(5.0, "1", "measured: white noise reaches 4.5 in a frame")
     high: float = threshold(0.25, "cycles/pixel", "theory: half of the range of frequencies is high")
@@ -95,15 +91,15 @@ def find_pixel_pattern(survey: Survey) -> Correction | None:
 def _motion_beside_pattern(moments: Moments) -> NDArray[np.bool_] | None:
     """Mark, (H, W), where the scene moves, if the fine detail of the mean belongs to the sensor; else return None."""
     mean, change = luminance(moments.mean), moments.change
-    if moments.count < _LIMITS.frames:
+    if moments.count < FEWEST:
         return None
     noise, slopes = float(np.median(change)), _squared_slope(cv2.GaussianBlur(mean, (0, 0), 2.0))
-    edges = slopes > np.quantile(slopes, _LIMITS.steep)
+    edges = slopes > np.quantile(slopes, STRIPES.steep)
     if not edges.any():
         return None
     moved = np.maximum(change - np.float32(noise), 0)
     motion = float(np.sqrt(np.median(moved[edges] / slopes[edges])))
-    if motion < _LIMITS.motion:
+    if motion < STRIPES.motion:
         return None
     fine = mean - cv2.GaussianBlur(mean, (0, 0), max(motion, 1))
     usual = (slopes <= np.median(slopes)) & _usual(fine)
@@ -111,11 +107,11 @@ def _motion_beside_pattern(moments: Moments) -> NDArray[np.bool_] | None:
         return None
     slope, flicker = _squared_slope(fine)[usual], change[usual]
     gained = abs(float(np.mean((slope - slope.mean()) * (flicker - flicker.mean()))))
-    if gained > _LIMITS.static * motion**2 * float(slope.var()):
+    if gained > STRIPES.static * motion**2 * float(slope.var()):
         return None
     # Edges are few, so that motion is known only over wide windows.
     moved, slopes = (cv2.GaussianBlur(some * edges, (0, 0), min(mean.shape) / 8) for some in (moved, slopes))
-    return np.asarray(moved >= _LIMITS.motion**2 * slopes)
+    return np.asarray(moved >= STRIPES.motion**2 * slopes)
 
 
 def _segment_starts(survey: Survey, moments: Moments) -> tuple[int, ...]:

@@ -14,6 +14,14 @@ from ..core.arrays import FloatArray
 from ..io.source import Window
 from .survey import reduced_shape
 
+# Root mean square of the shifts of frames from which the camera moves, pixels: the air alone moves frames by less.
+_MOVING = 3.0
+
+
+def camera_moves(shifts: NDArray[np.float64]) -> bool:
+    """Tell from the shifts of frames, (T, 2) in pixels, whether the camera moves."""
+    return float(np.sqrt(np.mean(np.sum(shifts**2, axis=1)))) >= _MOVING
+
 
 @dataclass(frozen=True)
 class Placement:

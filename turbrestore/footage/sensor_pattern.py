@@ -24,17 +24,17 @@ from ..core.arrays import FloatArray, luminance
 from ..core.decision import Decision
 from ..core.gradient import sobel_gradient
 from ..core.thresholds import threshold
+from ..io.counts import NEIGHBOURS
 from ..io.source import Window
 from .correction import Correction
 from .placement import relative_window
-from .survey import Survey
+from .survey import FEWEST, Survey
 
 
 @dataclass(frozen=True)
 class _Thresholds:
     """What tells stripes, warm pixels and dead columns of the sensor from the scene."""
 
-    frames: int = threshold(8, "frames", "chosen: half and double pass every test")  # fewest
     # Smoothing across the stripes.
     across: float = threshold(3.0, "pixels", "test: test_offsets_of_columns_and_rows_are_subtracted")
     # Least offset, in standard errors of the mean of the frames and in intensity, that is worth a correction.
@@ -44,6 +44,7 @@ class _Thresholds:
     static: float = threshold(0.25, "1", "test: test_stripes_of_the_scene_are_left")
     # Gradient of the edges whose motion is measured, in deviations of the noise, and the least motion.
     edge: float = threshold(8.0, "1", "test: test_stripes_of_the_scene_are_left")
+    steep: float = threshold(0.9, "1", "chosen: quantile of the slopes from which motion is measured")
     motion: float = threshold(0.3, "pixels", "chosen: half and double pass every test")
     # Parts along the stripes, and the least correlation of their offsets.
     parts: int = threshold(3, "parts", "test: test_offsets_of_columns_and_rows_are_subtracted")
@@ -66,7 +67,7 @@ class _Thresholds:
     noise: float = threshold(1 / 1020, "intensity", "chosen: half and double pass every test")
 
 
-_LIMITS = _Thresholds()
+LIMITS = _Thresholds()
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +92,12 @@ class _Stripes:
 
 def find_stripes(survey: Survey) -> Correction | None:
     """Find stripes, dead columns and rows, and warm pixels of the sensor."""
-    if len(survey.numbers) < _LIMITS.frames:
+    if len(survey.numbers) < FEWEST:
         return None
     moments = survey.moments
     mean, variance, usual = luminance(moments.mean), moments.change, max(moments.noise, 1e-4)
     motion = _motion(mean, variance, usual)
-    if motion < _LIMITS.motion:
+    if motion < LIMITS.motion:
         return None
     dead = (_dead(variance, usual), _dead(variance.T, usual))
     offsets = tuple(
@@ -123,7 +124,7 @@ def _motion(mean: FloatArray, variance: FloatArray, noise: float) -> float:
     """Root of the median squared motion of the edges of the scene, across themselves."""
     smooth = cv2.GaussianBlur(mean, (0, 0), 1.0)
     squares = (cv2.Scharr(smooth, cv2.CV_32F, 1, 0) / 32) ** 2 + (cv2.Scharr(smooth, cv2.CV_32F, 0, 1) / 32) ** 2
-    edges = squares > max((_LIMITS.edge * noise) ** 2 / 4, float(np.quantile(squares, 0.9)))
+    edges = squares > max((LIMITS.edge * noise) ** 2 / 4, float(np.quantile(squares, LIMITS.steep)))
     if not edges.any():
         return 0.0
     return float(np.sqrt(np.median(np.maximum(variance[edges] - noise**2, 0) / squares[edges])))
@@ -131,15 +132,15 @@ def _motion(mean: FloatArray, variance: FloatArray, noise: float) -> float:
 
 def _offsets(mean: FloatArray, variance: FloatArray, error: float, motion: float) -> FloatArray:
     """Column offsets; all zero if they belong to the scene."""
-    fine = mean - cv2.GaussianBlur(mean, (0, 1), _LIMITS.across)
+    fine = mean - cv2.GaussianBlur(mean, (0, 1), LIMITS.across)
     offsets = np.median(fine, axis=0).astype(np.float32)
     size = float(np.sqrt(np.mean(np.median(np.abs(offsets)) ** 2)))
-    parts = [np.median(part, axis=0) for part in np.array_split(fine, _LIMITS.parts)]
+    parts = [np.median(part, axis=0) for part in np.array_split(fine, LIMITS.parts)]
     clear = (
-        size >= max(_LIMITS.clearly * 1.25 * error / np.sqrt(len(mean)), _LIMITS.least)
-        and offsets.std() <= _LIMITS.largest
+        size >= max(LIMITS.clearly * 1.25 * error / np.sqrt(len(mean)), LIMITS.least)
+        and offsets.std() <= LIMITS.largest
     )
-    if not clear or np.corrcoef(parts).min() < _LIMITS.alike:
+    if not clear or np.corrcoef(parts).min() < LIMITS.alike:
         return np.zeros_like(offsets)
     slope = np.gradient(offsets) ** 2
     level = np.median(variance, axis=0)
@@ -147,18 +148,18 @@ def _offsets(mean: FloatArray, variance: FloatArray, error: float, motion: float
     steep, flat = slope >= np.quantile(slope, 0.75), slope <= np.quantile(slope, 0.25)
     gained = float(np.median(level[steep]) - np.median(level[flat]))
     expected = motion**2 * float(np.median(slope[steep]) - np.median(slope[flat]))
-    return offsets if gained < _LIMITS.static * expected else np.zeros_like(offsets)
+    return offsets if gained < LIMITS.static * expected else np.zeros_like(offsets)
 
 
 def _dead(variance: FloatArray, noise: float) -> NDArray[np.bool_]:
     """Mark the columns that have no noise while those around do."""
     level = np.sqrt(np.median(variance, axis=0)).astype(np.float32)
     windows = np.lib.stride_tricks.sliding_window_view(
-        np.pad(level, _LIMITS.around, mode="reflect"), 2 * _LIMITS.around + 1
+        np.pad(level, LIMITS.around, mode="reflect"), 2 * LIMITS.around + 1
     )
     around = np.median(windows, axis=1)
-    dead = level < _LIMITS.dead * np.minimum(around, noise if noise > _LIMITS.noise else 0)
-    if dead.mean() > _LIMITS.most_dead:
+    dead = level < LIMITS.dead * np.minimum(around, noise if noise > LIMITS.noise else 0)
+    if dead.mean() > LIMITS.most_dead:
         return np.zeros_like(dead)
     # Columns at the border are bars, or light that is clipped there.
     alive = np.flatnonzero(~dead)
@@ -168,18 +169,16 @@ def _dead(variance: FloatArray, noise: float) -> NDArray[np.bool_]:
 
 def _warm(mean: FloatArray, variance: FloatArray, noise: float, motion: float) -> NDArray[np.bool_]:
     """Mark static pixels that differ, each alone, from what is around them."""
-    height, least = _above_around(mean), max(_LIMITS.clearly * noise, 2 * _LIMITS.least)
-    ring = np.ones((3, 3), np.uint8)
-    ring[1, 1] = 0
-    over = np.where(height > 0, mean - cv2.dilate(mean, ring), cv2.erode(mean, ring) - mean)
-    alone = (np.abs(height) > least) & (over > _LIMITS.alone * np.abs(height))
-    warm = alone & (variance - noise**2 < _LIMITS.static * (motion * height) ** 2)
+    height, least = _above_around(mean), max(LIMITS.clearly * noise, 2 * LIMITS.least)
+    over = np.where(height > 0, mean - cv2.dilate(mean, NEIGHBOURS), cv2.erode(mean, NEIGHBOURS) - mean)
+    alone = (np.abs(height) > least) & (over > LIMITS.alone * np.abs(height))
+    warm = alone & (variance - noise**2 < LIMITS.static * (motion * height) ** 2)
     # Letters are drawn over the noise; a lone pixel among their strokes is one of them.
     smooth = cv2.medianBlur(mean, 3)
     slope = np.hypot(*sobel_gradient(smooth))
-    drawn = (variance < (_LIMITS.drawn * noise) ** 2) & (slope > _LIMITS.edge * noise)
-    warm &= cv2.dilate(drawn.astype(np.uint8), np.ones((2 * _LIMITS.around_drawn + 1,) * 2, np.uint8)) == 0
-    return warm if warm.mean() <= _LIMITS.most_warm else np.zeros_like(warm)
+    drawn = (variance < (LIMITS.drawn * noise) ** 2) & (slope > LIMITS.edge * noise)
+    warm &= cv2.dilate(drawn.astype(np.uint8), np.ones((2 * LIMITS.around_drawn + 1,) * 2, np.uint8)) == 0
+    return warm if warm.mean() <= LIMITS.most_warm else np.zeros_like(warm)
 
 
 def _above_around(image: FloatArray) -> FloatArray:

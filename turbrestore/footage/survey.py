@@ -20,13 +20,16 @@ from ..core.noise import estimate_noise
 from ..core.robust import spread
 from ..io.pixels import PixelArray
 from ..io.source import FrameSource
+from ..registration.camera.global_shift import LONGEST_SIDE
+from ..registration.flow import MIN_SIDE
 from ..runtime.scratch import drop_pages, iter_frames, new_stack
 from .correction import Correction
 
-# Most and fewest frames that are kept whole; those beyond the fewest take at most so many bytes.
-_MOST, _FEWEST, _WHOLE_BYTES = 48, 9, 4e8
-# Longest and shortest side of reduced frames, pixels, and about how many numbers all of them are.
-_SIDE, _SHORTEST, _NUMBERS = 192, 16, 8e6
+# Most frames that are kept whole, and fewest, which tell what stays from what moves; those beyond take at most so many
+# bytes.
+_MOST, FEWEST, _WHOLE_BYTES = 48, 9, 4e8
+# About how many numbers all reduced frames are.
+_NUMBERS = 8e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +114,7 @@ def survey_memory(shape: tuple[int, ...], in_scratch: bool) -> float:
     """Bytes that a survey takes of frames of shape (T, H, W) or (T, H, W, 3): whole and reduced ones."""
     whole = float(np.prod(shape[1:])) * 4 * (2 if in_scratch else _whole_frames(shape, 4))
     # One more while they are corrected, and what the light is measured from.
-    return whole + 4.0 * 3 * float(np.prod(_small_shape(shape)))
+    return whole + 12 * float(np.prod(_small_shape(shape)))
 
 
 def survey_scratch_bytes(shape: tuple[int, ...]) -> float:
@@ -121,13 +124,14 @@ def survey_scratch_bytes(shape: tuple[int, ...]) -> float:
 
 def _whole_frames(shape: tuple[int, ...], itemsize: int) -> int:
     most = int(_WHOLE_BYTES / (itemsize * np.prod(shape[1:], dtype=float)))
-    return min(shape[0], max(_FEWEST, min(_MOST, most)))
+    return min(shape[0], max(FEWEST, min(_MOST, most)))
 
 
 def _small_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
     """(T, h, w) or (T, h, w, 3) of the reduced frames: smaller ones where there are many."""
-    side = min(float(_SIDE), (_NUMBERS * max(shape[1:3]) ** 2 / np.prod(shape, dtype=float)) ** 0.5)
-    return reduced_shape(shape, side, _SHORTEST)
+    # Shifts are measured on them, and flow needs the shortest side.
+    side = min(float(LONGEST_SIDE), (_NUMBERS * max(shape[1:3]) ** 2 / np.prod(shape, dtype=float)) ** 0.5)
+    return reduced_shape(shape, side, MIN_SIDE)
 
 
 def reduced_shape(shape: tuple[int, ...], side: float, shortest: int) -> tuple[int, ...]:

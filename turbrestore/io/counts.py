@@ -26,7 +26,7 @@ from .source import FrameSource
 
 # Percentage of the frames at either end whose extremes do not count.
 _FEW = 10
-_NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
+NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 # Unsigned numbers of four bytes and more fill their type if one of them reaches this share of it.
 _FILLED = 1 / 256
 
@@ -155,6 +155,6 @@ def _ends(frame: PixelArray) -> tuple[float, float, float, float]:
     highest, lowest = float(up.max()), float(down.min())
     if min(values.shape[:2]) < 3:
         return lowest, lowest, highest, highest
-    high = float(np.minimum(up, cv2.dilate(up, _NEIGHBOURS)).max())
-    low = float(np.maximum(down, cv2.erode(down, _NEIGHBOURS)).min())
+    high = float(np.minimum(up, cv2.dilate(up, NEIGHBOURS)).max())
+    low = float(np.maximum(down, cv2.erode(down, NEIGHBOURS)).min())
     return lowest, low, high, highest

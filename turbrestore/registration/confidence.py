@@ -33,16 +33,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arrays import ROUNDING, FloatArray, check_grey
+from ..core.gradient import gradient_noise
 from ..core.noise import estimate_noise
 from ..runtime.jit import jit
 
 # Standard deviations of the windows of the gradient and of the tensor, pixels.
 _GRADIENT_WINDOW, _TENSOR_WINDOW = 1.0, 2.0
 _AREA = 4 * np.pi * _TENSOR_WINDOW**2
-# Variance of a derivative, in that window, of white noise of unit variance; noise rarely exceeds three times that.
-_GRADIENT_NOISE = 1 / (8 * np.pi * _GRADIENT_WINDOW**4)
+# The noise of a derivative rarely exceeds three times its variance.
 _NOISE_MARGIN = 3.0
-# The same for Scharr's derivative, which damps the finest noise, without margin.
+# Variance of Scharr's derivative, in that window, of white noise of unit variance.
 _SCHARR_NOISE = 0.0214
 # τ, pixels; m and κ.
 _DEVIATION = 0.5
@@ -64,7 +64,7 @@ def flow_confidence(reference: ArrayLike) -> Tensors:
     image = check_grey(reference, "reference")
     dx, dy = _gradient(image)
     xx, xy, yy = (cv2.GaussianBlur(product, (0, 0), _TENSOR_WINDOW).ravel() for product in (dx * dx, dx * dy, dy * dy))
-    noise = np.float32(_NOISE_MARGIN * _GRADIENT_NOISE * estimate_noise(image) ** 2)
+    noise = np.float32(_NOISE_MARGIN * (gradient_noise(_GRADIENT_WINDOW) * estimate_noise(image)) ** 2)
     tensor = np.empty((3, *image.shape), np.float32)
     subtract_noise(noise, xx, xy, yy, tensor.reshape(3, -1))
     tensors = [tensor]

@@ -11,6 +11,8 @@ from ..runtime.scratch import iter_frames
 from .warp import inside
 
 Rectangle = tuple[int, int, int, int]
+# Least share of the frames that show every border pixel of a cropped image.
+SEEN = 0.9
 
 
 def coverage(flows: ArrayLike) -> FloatArray:
@@ -24,7 +26,7 @@ def coverage(flows: ArrayLike) -> FloatArray:
     return total / np.float32(len(stack))
 
 
-def well_seen(seen: ArrayLike, least: float = 0.9, margin: int = 0, smallest: int = 16) -> Rectangle:
+def well_seen(seen: ArrayLike, least: float = SEEN, margin: int = 0, smallest: int = 16) -> Rectangle:
     """Rectangle whose border enough frames show, by their share ``seen`` (H, W).
 
     The side with the worst pixel is trimmed until no pixel of the border is below ``least``; pixels inside are not

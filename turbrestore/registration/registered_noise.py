@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import ROUNDING, FloatArray, luminance
 from ..core.noise_spectrum import RINGS, NoiseSpectrum, fit_noise_spectrum
+from ..core.robust import spread
 from ..runtime.scratch import iter_frames
 from ..runtime.threads import map_ahead
 from .recentring import recentre
@@ -58,7 +59,7 @@ def noise_of_frames(frames: Frames, flows: Frames, image: FloatArray, is_mean: b
     ``image`` (H, W[, 3]) is the mean of the frames, or one of them.
     """
     grey, count = luminance(image), len(frames)
-    picked = np.unique(np.linspace(0, count - 1, min(count, _FRAMES)).round().astype(int))
+    picked = np.unique(spread(count, _FRAMES))
     residuals = (luminance(warp(frames[number], flows[number])) - grey for number in picked)
     # The mean contains a part of the noise of each frame; one frame has as much noise as the next.
     share = count / max(count - 1, 1) if is_mean else 0.5

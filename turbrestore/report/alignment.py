@@ -9,11 +9,9 @@ from ..display.figure import WIDTH
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Inches: margins; height of figures with curves, room above a row that has a title, and place of the vertical label.
-_LEFT, _RIGHT, _BOTTOM, _TOP = 0.68, 0.1, 0.46, 0.1
-_HEIGHT, _TITLED, _LABEL = 3.2, 0.3, 0.12
-# Inches: room on the right of a map for its colour bar, gap before the bar, and its width.
-_MAP_RIGHT, _GAP, _BAR = 0.6, 0.1, 0.13
+# Inches: room for labels on the left and below, margins and gaps elsewhere, height of figures with curves, room above a
+# row that has a title, and on the right of a map for its colour bar.
+_LEFT, _BOTTOM, _MARGIN, _HEIGHT, _TITLED, _MAP_RIGHT = 0.68, 0.46, 0.1, 3.2, 0.3, 0.6
 
 
 def take_title(figure: Figure) -> str:
@@ -31,11 +29,11 @@ def align_curves(figure: Figure) -> None:
     figure.set_layout_engine(None)
     figure.set_size_inches(WIDTH, _HEIGHT)
     rows = len(figure.axes)
-    above = _TITLED if any(axes.get_title(loc="left") for axes in figure.axes) else _TOP
+    above = _TITLED if any(axes.get_title(loc="left") for axes in figure.axes) else _MARGIN
     each = (_HEIGHT - _BOTTOM - above - (rows - 1) * _TITLED) / rows
     figure.subplots_adjust(
         left=_LEFT / WIDTH,
-        right=1 - _RIGHT / WIDTH,
+        right=1 - _MARGIN / WIDTH,
         bottom=_BOTTOM / _HEIGHT,
         top=1 - above / _HEIGHT,
         hspace=_TITLED / each,
@@ -43,7 +41,7 @@ def align_curves(figure: Figure) -> None:
     for axes in figure.axes:
         # Axes of equal scale would be narrow and in the middle.
         axes.set_anchor("SW")
-        axes.yaxis.set_label_coords((_LABEL - _LEFT) / (WIDTH - _LEFT - _RIGHT), 0.5)
+        axes.yaxis.set_label_coords((_MARGIN - _LEFT) / (WIDTH - _LEFT - _MARGIN), 0.5)
 
 
 def align_map(figure: Figure) -> None:
@@ -54,10 +52,10 @@ def align_map(figure: Figure) -> None:
     width = WIDTH - _LEFT - _MAP_RIGHT
     # A map that would be higher than two widths keeps its shape in a narrower place.
     height = width * min(abs((bottom - top) / (right - left)), 2.0)
-    whole = height + _BOTTOM + _TOP
+    whole = height + _BOTTOM + _MARGIN
     figure.set_size_inches(WIDTH, whole)
     axes.set_position((_LEFT / WIDTH, _BOTTOM / whole, width / WIDTH, height / whole))
     for bar in bars:
-        start = _LEFT + width + _GAP
-        bar.set_box_aspect(height / _BAR)
-        bar.set_position((start / WIDTH, _BOTTOM / whole, _BAR / WIDTH, height / whole))
+        start = _LEFT + width + _MARGIN
+        bar.set_box_aspect(height / _MARGIN)
+        bar.set_position((start / WIDTH, _BOTTOM / whole, _MARGIN / WIDTH, height / whole))

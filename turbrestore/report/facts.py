@@ -11,15 +11,13 @@ from typing import Any
 import numpy as np
 
 from ..core.remarks import counted
-from ..registration.coverage import coverage
+from ..registration.coverage import SEEN, coverage
 from ..results import Restoration
 from ..runs.run_record import RunRecord
 from ..settings import RestoreParams
 from ..wording import interval_words
 from .detail import detail_spectrum
 
-# Share of the frames that show the interior.
-_SEEN = 0.9
 _STAGE_NAMES = {
     "read": "Reading",
     "centroid": "Centroid",
@@ -217,7 +215,7 @@ def _uncertainty_facts(restoration: Restoration) -> Iterator[Fact]:
     x, y, width, height = restoration.crop
     known = np.isfinite(deviation)
     # Few frames show the border, and its deviation says nothing of the rest.
-    interior = known & (coverage(restoration.centroid.flows)[y : y + height, x : x + width] >= _SEEN)
+    interior = known & (coverage(restoration.centroid.flows)[y : y + height, x : x + width] >= SEEN)
     if interior.any():
         middle, high = (255 * float(value) for value in np.quantile(deviation[interior], (0.5, 0.95)))
         note = f"of 255, in the median of what nine frames in ten show; below {high:.1f} in 95 % of it"

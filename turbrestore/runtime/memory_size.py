@@ -35,8 +35,8 @@ class MemorySize(float):
 
 def size_text(size: float) -> str:
     """Write a number of bytes with a unit in which it is no less than one."""
-    if size >= 1e9:
-        return f"{size / 1e9:.2f} GB"
-    if size >= 1e6:
-        return f"{-(-size // 1e6):.0f} MB"
-    return f"{size / 1e3:.1f} kB" if size >= 1e3 else f"{size:g} bytes"
+    if size >= _UNITS["gb"]:
+        return f"{size / _UNITS['gb']:.2f} GB"
+    if size >= _UNITS["mb"]:
+        return f"{-(-size // _UNITS['mb']):.0f} MB"
+    return f"{size / _UNITS['kb']:.1f} kB" if size >= _UNITS["kb"] else f"{size:g} bytes"

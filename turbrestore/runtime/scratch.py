@@ -19,15 +19,15 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.arrays import PART
 from ..core.errors import StorageError
+from .memory_size import size_text
 
 Item = TypeVar("Item")
 # A private map would lose what has been written to the pages that are dropped.
 _SHARED = ("r", "r+", "w+")
 # Left free beside the file: others write to the disk as well.
 _SPARE = 1 << 26
-# Numbers in a part of a large array.
-_PART = 1 << 22
 
 
 def new_stack(shape: tuple[int, ...], folder: Path | None = None, dtype: Any = np.float32) -> NDArray[Any]:
@@ -40,8 +40,8 @@ def new_stack(shape: tuple[int, ...], folder: Path | None = None, dtype: Any = n
         free = shutil.disk_usage(folder).free
         if free < size + _SPARE:
             raise StorageError(
-                f"{folder}: expected {size / 1e9:.1f} GB free for what memory does not hold, found "
-                f"{free / 1e9:.1f} GB; name another scratch folder"
+                f"{folder}: expected {size_text(size)} free for what memory does not hold, found "
+                f"{size_text(free)}; name another scratch folder"
                 f"{' by TMPDIR' if folder == Path(tempfile.gettempdir()) else ''}, or a higher memory limit"
             )
         with tempfile.TemporaryFile(dir=folder, prefix="turbrestore-") as file:
@@ -51,7 +51,7 @@ def new_stack(shape: tuple[int, ...], folder: Path | None = None, dtype: Any = n
                 file.truncate(size)
             return np.memmap(file, dtype, "r+", shape=shape)
     except OSError as error:
-        raise StorageError(f"{folder}: cannot hold a file of {size / 1e9:.1f} GB ({error.strerror})") from error
+        raise StorageError(f"{folder}: cannot hold a file of {size_text(size)} ({error.strerror})") from error
 
 
 def fill_stack(
@@ -117,7 +117,7 @@ def fill_frames(stack: NDArray[Any], items: Iterable[NDArray[Any]]) -> Iterator[
 
 def iter_parts(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
     """Yield consecutive pieces of an array, each small, and hand back their memory if it is a mapped file."""
-    step = max(1, len(array) * _PART // max(array.size, 1))
+    step = max(1, len(array) * PART // max(array.size, 1))
     yield from iter_frames(array[start : start + step] for start in range(0, len(array), step))
 
 
@@ -143,7 +143,7 @@ def variance_of(stack: NDArray[np.float32]) -> NDArray[np.float32]:
     """Variance of a stack (T, ...) over its first axis."""
     variance = np.zeros(stack.shape[1:], np.float32)
     rows = np.atleast_1d(variance)
-    step = max(1, len(rows) * _PART // max(rows.size, 1))
+    step = max(1, len(rows) * PART // max(rows.size, 1))
     for start in range(0, len(rows), step):
         strip = rows[start : start + step]
         some = stack.reshape(-1, 1) if stack.ndim == 1 else stack[:, start : start + step]

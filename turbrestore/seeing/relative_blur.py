@@ -26,13 +26,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.arrays import FloatArray, check_grey
 from ..core.errors import DataError, require
+from ..registration.flow import MIN_SIDE
 from ..runtime.fourier import rfft2
 
 Float64Array = NDArray[np.float64]
 
-# Side of the tiles, which overlap by half, and of the smallest image, pixels: displacements of 2 px leave power at the
-# lowest frequencies only.
-_TILE, _SMALLEST = 64, 16
+# Side of the tiles, which overlap by half, pixels: displacements of 2 px leave power at the lowest frequencies only.
+_TILE = 64
 # Lowest frequency, periods in a tile: the Hann window spreads the mean brightness over less than 1.5.  Highest, cycles
 # per pixel: above, interpolation has changed the spectrum.
 _LOWEST, _HIGHEST = 1.5, 0.35
@@ -119,8 +119,8 @@ class _Tiles:
     @classmethod
     def of(cls, shape: tuple[int, ...]) -> _Tiles:
         """Lay tiles over images of a shape."""
-        if min(shape) < _SMALLEST:
-            raise DataError(f"image: expected at least {_SMALLEST} pixels a side, found shape {tuple(shape)}")
+        if min(shape) < MIN_SIDE:
+            raise DataError(f"image: expected at least {MIN_SIDE} pixels a side, found shape {tuple(shape)}")
         size = height, width = min(_TILE, shape[0]), min(_TILE, shape[1])
         rows, columns = (_starts(length, side) for length, side in zip(shape, size, strict=True))
         window = np.outer(_hann(height), _hann(width))

@@ -24,13 +24,14 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..core.noise import estimate_noise
-from ..footage.frame_selection import best_frames, frame_quality
+from ..footage.frame_selection import DARK, best_frames, frame_quality
+from ..results import FEW
 
 SHARES = (0.1, 0.25, 0.5)
 # Error of the models of blur and registration, intensity, as in Wiener deconvolution.
-_ERROR, _DARK = 0.002, 1e-3
-# Fewest frames that are suggested: those whose halves still tell what they agree on.  What a share has to be worth.
-_FEWEST, _WORTHWHILE = 8, 1.05
+_ERROR = 0.002
+# What a share has to be worth; at least as many frames are suggested as whose halves still tell what they agree on.
+_WORTHWHILE = 1.05
 # Best frames, and worst ones, that are listed.
 _LISTED = 10
 # Side of the image that the filter of the quality is tried on, pixels.
@@ -70,7 +71,7 @@ def quality_list(frames: Iterable[FloatArray]) -> QualityList:
 def measure_quality(frames: Iterable[FloatArray]) -> NDArray[np.float64]:
     """Quality, noise and mean brightness of every frame, (T, 3)."""
     greys = map(luminance, frames)
-    return np.array([(frame_quality([grey])[0], estimate_noise(grey), max(grey.mean(), _DARK)) for grey in greys])
+    return np.array([(frame_quality([grey])[0], estimate_noise(grey), max(grey.mean(), DARK)) for grey in greys])
 
 
 def sort_by_quality(measured: NDArray[np.float64]) -> QualityList:
@@ -81,7 +82,7 @@ def sort_by_quality(measured: NDArray[np.float64]) -> QualityList:
     sizes = np.arange(1, len(quality) + 1)
     means = np.cumsum(np.sort(np.sqrt(quality))[::-1]) / sizes
     worth = means / np.sqrt(z**2 / sizes + f**2)
-    least = min(_FEWEST, len(sizes)) - 1
+    least = min(FEW, len(sizes)) - 1
     best = least + int(np.argmax(worth[least:]))
 
     def keeping(count: int) -> KeptShare:
@@ -128,4 +129,4 @@ def _noise_energy() -> float:
     impulse = np.zeros((_SIDE, _SIDE), np.float32)
     impulse[_SIDE // 2, _SIDE // 2] = 1
     # The quality of an image is its energy a pixel over its squared mean.
-    return float(frame_quality([impulse])[0]) * max(float(impulse.mean()), _DARK) ** 2 * impulse.size
+    return float(frame_quality([impulse])[0]) * max(float(impulse.mean()), DARK) ** 2 * impulse.size

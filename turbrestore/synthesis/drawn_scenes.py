@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 
 from ..core.arrays import FloatArray
-from .scenes import picture
+from .scenes import OVERSAMPLING, picture
 
 if TYPE_CHECKING:
     from PIL.Image import Image
     from PIL.ImageDraw import ImageDraw
 
 # Drawn this many times larger and averaged down, which avoids jagged edges; coordinates are those of a scene 224 wide.
-_OVERSAMPLING, _UNIT = 4, 224
+_UNIT = 224
 # Height of the ground of the street.
 _GROUND = 150
 
@@ -25,7 +25,7 @@ def road_sign(height: int, width: int) -> FloatArray:
     """Draw a blue road sign with places and distances in front of a brick wall."""
     from PIL import ImageDraw, ImageFont
 
-    scale = _OVERSAMPLING * width / _UNIT
+    scale = OVERSAMPLING * width / _UNIT
     wall = _enlarged(picture("brick", height, width))[..., None] * np.array([0.95, 0.80, 0.70], np.float32) + 0.12
     canvas = _canvas(wall)
     drawing = ImageDraw.Draw(canvas)
@@ -54,12 +54,12 @@ def number_plate(height: int, width: int) -> FloatArray:
     """Draw the rear of a car with its number plate, lights and bumper."""
     from PIL import ImageDraw, ImageFont
 
-    scale = _OVERSAMPLING * width / _UNIT
-    fall = np.linspace(0.42, 0.2, height * _OVERSAMPLING, dtype=np.float32)[:, None, None]
-    paint = np.broadcast_to(fall * np.array([1.0, 0.32, 0.26], np.float32), (*fall.shape[:1], width * _OVERSAMPLING, 3))
+    scale = OVERSAMPLING * width / _UNIT
+    fall = np.linspace(0.42, 0.2, height * OVERSAMPLING, dtype=np.float32)[:, None, None]
+    paint = np.broadcast_to(fall * np.array([1.0, 0.32, 0.26], np.float32), (*fall.shape[:1], width * OVERSAMPLING, 3))
     canvas = _canvas(paint)
     drawing = ImageDraw.Draw(canvas)
-    middle = height * _OVERSAMPLING / 2
+    middle = height * OVERSAMPLING / 2
     drawing.rectangle([0, middle + 52 * scale, 224 * scale, middle + 80 * scale], fill=(38, 40, 44))
     for left in (4, 192):
         drawing.rounded_rectangle(
@@ -86,8 +86,8 @@ def street(height: int, width: int) -> FloatArray:
     """Draw a row of brick houses with windows behind a road with lamps and a sign."""
     from PIL import ImageDraw
 
-    scale = _OVERSAMPLING * width / _UNIT
-    tall, wide = height * _OVERSAMPLING, width * _OVERSAMPLING
+    scale = OVERSAMPLING * width / _UNIT
+    tall, wide = height * OVERSAMPLING, width * OVERSAMPLING
     fall = np.linspace(0, 1, tall, dtype=np.float32)[:, None, None]
     sky = np.broadcast_to(
         np.array([0.62, 0.74, 0.88], np.float32) + fall * np.array([0.3, 0.2, 0.05], np.float32), (tall, wide, 3)
@@ -187,7 +187,7 @@ def _small_texture(name: str, height: int, width: int) -> FloatArray:
 
 
 def _enlarged(image: FloatArray) -> FloatArray:
-    return cv2.resize(image, None, fx=_OVERSAMPLING, fy=_OVERSAMPLING, interpolation=cv2.INTER_CUBIC)
+    return cv2.resize(image, None, fx=OVERSAMPLING, fy=OVERSAMPLING, interpolation=cv2.INTER_CUBIC)
 
 
 def _canvas(image: FloatArray) -> Image:

@@ -29,7 +29,7 @@ _FILES = {"cat": "chelsea.png", "rocket": "rocket.jpg"}
 WORDS = ("harbour", "window", "engine", "seventh", "market", "glacier", "copper", "journey", "planet", "bridge")
 _DARK, _BRIGHT = 0.12, 0.88
 # Scenes are drawn this many times larger and averaged down, which avoids jagged edges.
-_OVERSAMPLING = 4
+OVERSAMPLING = 4
 _LINE_SPACING = 1.2
 # Letters are about half as high as the font size.
 _SMALLEST_FONT = 6
@@ -53,7 +53,7 @@ def resolution_chart(height: int = 256, width: int = 256) -> FloatArray:
             top, left = rows[row], columns[column]
             h, w = int(rows[row + 1] - top), int(columns[column + 1] - left)
             margin = max(2, min(h, w) // 14)
-            inner = paint((h - 2 * margin) * _OVERSAMPLING, (w - 2 * margin) * _OVERSAMPLING)
+            inner = paint((h - 2 * margin) * OVERSAMPLING, (w - 2 * margin) * OVERSAMPLING)
             small = cv2.resize(inner, (w - 2 * margin, h - 2 * margin), interpolation=cv2.INTER_AREA)
             chart[top + margin : top + h - margin, left + margin : left + w - margin] = small
     return chart
@@ -86,11 +86,11 @@ def printed_words(height: int, width: int, words: Sequence[str] = WORDS) -> Floa
 
     require(min(height, width) >= SMALLEST, f"size: expected at least {SMALLEST} pixels a side, found {width}×{height}")
     require(any(word.strip() for word in words), "words: expected at least one word, found none")
-    margin = max(4, min(height, width) // 20) * _OVERSAMPLING
-    room = (width * _OVERSAMPLING - 2 * margin, height * _OVERSAMPLING - 2 * margin)
+    margin = max(4, min(height, width) // 20) * OVERSAMPLING
+    room = (width * OVERSAMPLING - 2 * margin, height * OVERSAMPLING - 2 * margin)
     font, lines = _largest_print(words, *room)
     require(bool(lines), f"words: expected words that fit on {width}×{height} pixels, found {len(words)}; print fewer")
-    ink = Image.new("L", (width * _OVERSAMPLING, height * _OVERSAMPLING))
+    ink = Image.new("L", (width * OVERSAMPLING, height * OVERSAMPLING))
     drawing = ImageDraw.Draw(ink)
     pitch = room[1] / len(lines)
     for index, line in enumerate(lines):
@@ -104,7 +104,7 @@ def _largest_print(words: Sequence[str], width: int, height: int) -> tuple[FreeT
     from PIL import ImageFont
 
     size = float(height)
-    while size >= _SMALLEST_FONT * _OVERSAMPLING:
+    while size >= _SMALLEST_FONT * OVERSAMPLING:
         font = ImageFont.load_default(size)
         lines = _broken_lines(words, font, width)
         if lines and len(lines) * _LINE_SPACING * size <= height:
@@ -131,7 +131,7 @@ def _broken_lines(words: Sequence[str], font: FreeTypeFont | ImageFont, width: i
 def _bars(height: int, width: int) -> FloatArray:
     """Bars of increasing frequency, vertical in the upper half and horizontal in the lower."""
     x = np.linspace(0, 1, width, endpoint=False, dtype=np.float32)
-    finest = width / _OVERSAMPLING / 5
+    finest = width / OVERSAMPLING / 5
     phase = finest * (0.25 * x + 0.375 * x**2)
     upright = np.where(phase % 1 < 0.5, _DARK, _BRIGHT).astype(np.float32)
     y = np.linspace(0, 1, height - height // 2, endpoint=False, dtype=np.float32)
@@ -169,7 +169,7 @@ def _thin_lines(height: int, width: int) -> FloatArray:
     ink = np.zeros((height, width), np.uint8)
     for index, angle in enumerate(np.linspace(0, np.pi / 2, 11)):
         end = (round(width * float(np.cos(angle))), round(height * float(np.sin(angle))))
-        cv2.line(ink, (0, 0), end, 255, _OVERSAMPLING * (1 + index % 2), cv2.LINE_8)
+        cv2.line(ink, (0, 0), end, 255, OVERSAMPLING * (1 + index % 2), cv2.LINE_8)
     return _printed(ink)
 
 
@@ -180,7 +180,7 @@ def _printed(ink: NDArray[np.uint8]) -> FloatArray:
 def _checkerboard(height: int, width: int) -> FloatArray:
     """Squares of four sizes, one in each quarter."""
     y, x = np.mgrid[:height, :width]
-    side = np.where(y < height // 2, np.where(x < width // 2, 12, 8), np.where(x < width // 2, 6, 4)) * _OVERSAMPLING
+    side = np.where(y < height // 2, np.where(x < width // 2, 12, 8), np.where(x < width // 2, 6, 4)) * OVERSAMPLING
     return np.where((x // side + y // side) % 2 == 0, _DARK, _BRIGHT).astype(np.float32)
 
 

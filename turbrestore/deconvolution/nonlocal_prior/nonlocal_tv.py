@@ -43,7 +43,7 @@ from ...runtime.threads import ThreadTeam
 from .nonlocal_weights import NonlocalGraph
 
 # Bands of an image, which have at least so many rows; and pixels from which on threads share them.
-_BANDS, _LEAST_ROWS, _PARALLEL_PIXELS = 16, 32, 1 << 15
+_BANDS, _LEAST_ROWS, PARALLEL_PIXELS = 16, 32, 1 << 15
 
 
 class PairDual(NamedTuple):
@@ -89,7 +89,7 @@ class NonlocalPenalty:
         height, width = self.graph.shape
         rows = max(self.graph.reach, -(-height // _BANDS), _LEAST_ROWS)
         bands = [np.array([top, min(top + rows, height)]) * width for top in range(0, height, rows)]
-        parallel = self.team is not None and height * width >= _PARALLEL_PIXELS
+        parallel = self.team is not None and height * width >= PARALLEL_PIXELS
         for half in (bands[::2], bands[1::2]):
             for _ in self.team.map(work, half) if self.team is not None and parallel else map(work, half):
                 pass

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray
+from ...io.counts import NEIGHBOURS
 from ...io.pixels import PixelArray
 
 _MOST_STUCK = 0.005
@@ -26,8 +27,8 @@ _ALONE = 0.8
 _STILL, _MOVING = 1.5 / 255, 8 / 255
 # A neighbour belongs to the same letter if it always stands out by at least this share of the height of the pixel.
 _OF_LETTER = 0.3
-_RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
-_AROUND = np.array([(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)])
+# Places of the eight neighbours, from the pixel.
+_AROUND = np.argwhere(NEIGHBOURS) - 1
 
 
 class StuckPixelDetector:
@@ -68,9 +69,9 @@ class StuckPixelDetector:
         return none if len(stuck) > _MOST_STUCK * self._size else stuck
 
     def _compare_all(self, values: FloatArray) -> None:
-        around = cv2.dilate(values, _RING)
+        around = cv2.dilate(values, NEIGHBOURS)
         high = np.subtract(values, around, out=around) > self._excess
-        around = cv2.erode(values, _RING, dst=around)
+        around = cv2.erode(values, NEIGHBOURS, dst=around)
         low = np.subtract(around, values, out=around) > self._excess
         self._high = high if self._high is None else self._high & high
         self._low = low if self._low is None else self._low & low

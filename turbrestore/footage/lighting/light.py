@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ...core.arrays import ROUNDING, FloatArray, luminance
 from ...core.decision import Decision
-from ...core.robust import bisquare_weights, robust_scale
+from ...core.robust import ROUNDS, bisquare_weights, robust_scale
 from ...io.source import Window
 from ...registration.camera.global_shift import DEAD_ZONE, ShiftReference, measure_shift, prepare_shift_reference
 from ..correction import Correction
@@ -43,7 +43,6 @@ _EXPLAINED = 0.3
 _SATURATED = 0.995
 # Weight of a cosine of order j against its square, relative to the information of the frame.
 _SMOOTHNESS = 1e-4
-_ROUNDS = 4
 # Frames of the sample in which bands are looked for.
 _SOME = 24
 # Rows at which gains are compared, the percentage of frames beyond the range that they wander in, and the least gain.
@@ -268,7 +267,7 @@ def _weighted_fit(
     """Coefficients of the gain, and the mean robust squared residual."""
     weights = known.astype(np.float64)
     coefficients, residual = np.zeros(basis.shape[1]), 0.0
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         power = (weights * truth * truth).sum(axis=1)
         normal = basis.T @ (power[:, None] * basis)
         normal += np.diag(_SMOOTHNESS * power.sum() * np.arange(basis.shape[1]) ** 2 + ROUNDING**2)
@@ -281,7 +280,7 @@ def _affine_fit(values: FloatArray, truth: FloatArray, known: NDArray[np.bool_])
     """Gain and offset, and the mean robust squared residual."""
     weights = known.astype(np.float64)
     gain, offset, residual = 1.0, 0.0, 0.0
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         total = max(float(weights.sum()), ROUNDING**2)
         means = float((weights * truth).sum()) / total, float((weights * values).sum()) / total
         spread = float((weights * (truth - means[0]) ** 2).sum())

@@ -26,6 +26,7 @@ from ...core.robust import bisquare_weights, robust_scale
 from ...core.thresholds import threshold
 from ...io.source import Window
 from ...registration.camera.global_shift import known_shifts
+from ..survey import FEWEST
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,6 @@ class _Thresholds:
     # Deviation of the Gaussian average: as a share of the longer side of a frame, and in those of its blur.
     reach: float = threshold(0.045, "1", "chosen: half and double pass every test")
     reach_blurs: float = threshold(2.0, "1", "test: test_air_walkers_and_moving_cameras_are_no_light")
-    frames: int = threshold(8, "frames", "chosen: half and double pass every test")
     # Least deviation over time of the logarithm of g, at the percentile over the frame.
     change: float = threshold(0.03, "1", "chosen: half and double pass every test")
     percentile: int = threshold(90, "%", "chosen: half of it passes every test")
@@ -81,7 +81,7 @@ def measure_shade(
 
     ``frames`` (T, h, w), reduced, and blurred by ``blur`` pixels.
     """
-    if len(frames) < _LIMITS.frames or float(np.ptp(frames[0])) <= 0:
+    if len(frames) < FEWEST or float(np.ptp(frames[0])) <= 0:
         return None, ()
     reference = np.median(frames, axis=0).astype(np.float32)
     dark = np.float32(_LIMITS.dark * np.percentile(reference, _LIMITS.bright))

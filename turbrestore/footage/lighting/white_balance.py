@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ...core.arrays import ROUNDING, FloatArray, luminance
 from ...core.decision import Decision
-from ...core.robust import bisquare_weights, robust_scale
+from ...core.robust import ROUNDS, bisquare_weights, robust_scale
 from ...core.thresholds import threshold
 from ...registration.camera.global_shift import known_shifts
 from ..correction import Correction
@@ -38,7 +38,6 @@ class _Thresholds:
     change: float = threshold(0.01, "1", "measured: below 0.004 for still scenes, 0.006 in a clip of skiers")
     dark: float = threshold(0.02, "intensity", "chosen: half and double pass every test")
     saturated: float = threshold(0.98, "intensity", "test: test_channels_are_brought_to_their_mean, from below only")
-    rounds: int = threshold(4, "fits", "chosen: half and double pass every test")
 
 
 _LIMITS = _Thresholds()
@@ -99,7 +98,7 @@ def _gain(values: FloatArray, reference: NDArray[np.float64], usable: NDArray[np
         return 1.0
     weights: NDArray[np.floating] = np.ones(f.size)
     gain = 1.0
-    for _ in range(_LIMITS.rounds):
+    for _ in range(ROUNDS):
         gain = float((weights * r * f).sum() / max(float((weights * r * r).sum()), ROUNDING**2))
         residual = f - gain * r
         weights = bisquare_weights(residual, robust_scale(residual))

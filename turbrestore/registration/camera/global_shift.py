@@ -31,7 +31,7 @@ from ...runtime.scratch import iter_frames
 from ...runtime.threads import map_ahead
 
 # Images are reduced by a whole factor until no side is longer; larger ones would only take longer.
-_LONGEST_SIDE = 192
+LONGEST_SIDE = 192
 # Window of the local contrast normalisation, pixels of the reduced image, and intensity deviation below which a region
 # counts as flat.
 _WINDOW, _FLOOR = 6.0, 0.01
@@ -133,7 +133,7 @@ def known_shifts(stack: FloatArray, threads: int = 0) -> tuple[Shift, NDArray[np
 def reduce_image(image: FloatArray) -> FloatArray:
     """Reduce an image (H, W[, 3]) to a small luminance of zero mean and unit deviation in a Gaussian window."""
     height, width = image.shape[:2]
-    factor = -(-max(height, width) // _LONGEST_SIDE)
+    factor = -(-max(height, width) // LONGEST_SIDE)
     size = max(width // factor, 1), max(height // factor, 1)
     grey = luminance(image if factor == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA))
     centred = grey - cv2.GaussianBlur(grey, (0, 0), _WINDOW)

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...core.arrays import FloatArray, check_frames
+from ...core.robust import spread
 from ...runtime.scratch import iter_frames, mean_of
 from ...runtime.threads import map_ahead
 from .global_shift import DEAD_ZONE, LEAST_CORRELATION, Shift, known_shifts, overlap, reduce_image
@@ -68,7 +69,7 @@ def _poses(stack: FloatArray, shifts: Shift, found: NDArray[np.int64], threads: 
     """A_k by the number of the frame; empty if the camera neither turns nor zooms."""
     anchor = found[len(found) // 2]
     reference = reduce_image(stack[anchor])
-    sample = found[np.unique(np.linspace(0, len(found) - 1, _SAMPLES).round().astype(int))]
+    sample = found[np.unique(spread(len(found), _SAMPLES))]
     if not _turns(_measure(stack, reference, shifts - shifts[anchor], sample.tolist(), threads), stack.shape):
         return {}
     poses = _measure(stack, reference, shifts - shifts[anchor], found.tolist(), threads)
