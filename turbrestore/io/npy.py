@@ -25,6 +25,7 @@ from ..runtime.scratch import iter_parts, new_stack
 from .counts import source_of_numbers
 from .limits import DEFAULT_LIMITS, Limits, check_input, format_errors, input_errors
 from .output import atomic_output, frames_of_one_size
+from .pixels import LEAST_SIDE
 from .source import FrameSource
 
 # Arrays of more bytes may be read to a scratch file.
@@ -32,8 +33,6 @@ _LARGE = 1 << 22
 # Places along each axis at which the order of the axes is judged, and how much more alike planes must be to be taken
 # for the frames: those of 40 clips were more alike than the planes of their last axis, by a factor of 1.04 or more.
 _SAMPLES, _MORE_ALIKE = 48, 1.1
-# Frames have no shorter side.
-_LEAST_SIDE = 16
 # Planes of at most this share of the median contrast show nothing.
 _BLANK = 0.1
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -168,7 +167,7 @@ def _frames_first(path: Path, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
         raise DataError(f"{path}: expected frames of shape (T, H, W), found {shape}, which is that of one colour image")
     if (
         array.ndim == 3
-        and min(shape[:2]) >= _LEAST_SIDE
+        and min(shape[:2]) >= LEAST_SIDE
         and shape[2] > 1
         # Only square frames make the last two axes, and no others, equally long.
         and not shape[0] != shape[1] == shape[2]

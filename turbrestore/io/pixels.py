@@ -24,6 +24,8 @@ PixelArray = NDArray[Any]
 
 # 67 million pixels are two 8K frames; a frame of this size takes 800 MB as float32 RGB.
 MAX_PIXELS = 2**26
+# Least side of a frame whose pixels tell what they are, as that of the smallest frames that are restored.
+LEAST_SIDE = 16
 # Rounding and resampling overshoot a little; values further outside indicate another scale.
 FLOAT_MARGIN = 0.01
 # Patterns of a Bayer sensor, by the colours of its first pixels.

@@ -16,11 +16,10 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_image, from_unit
 from ..core.errors import DataError, require, require_between
+from ..registration.flow import MIN_SIDE
 from ..registration.flow_algebra import invert_flow
 from ..registration.warp import warp
 
-# No stage can measure motion in a smaller scene.
-SMALLEST_SCENE = 16
 _LEAST_CONTRAST = 1e-3
 
 
@@ -107,8 +106,8 @@ def check_scene(scene: ArrayLike) -> FloatArray:
     """
     image = check_image(scene, "scene")
     height, width = image.shape[:2]
-    if min(height, width) < SMALLEST_SCENE:
-        raise DataError(f"scene: expected at least {SMALLEST_SCENE}×{SMALLEST_SCENE} pixels, found {width}×{height}")
+    if min(height, width) < MIN_SIDE:
+        raise DataError(f"scene: expected at least {MIN_SIDE}×{MIN_SIDE} pixels, found {width}×{height}")
     lowest, highest = float(image.min()), float(image.max())
     if lowest < 0 or highest > 1:
         raise DataError(f"scene: expected values in 0 to 1, found {lowest:.6g} to {highest:.6g}; scale them")

@@ -29,7 +29,7 @@ from ...core.arrays import FloatArray, from_unit
 from ...core.errors import DataError
 from ..limits import DEFAULT_LIMITS, Limits, input_errors
 from ..output import atomic_output, frames_of_one_size
-from ..pixels import BAYER_REMARK, PixelArray, check_depth, demosaic, looks_like_bayer
+from ..pixels import BAYER_REMARK, LEAST_SIDE, PixelArray, check_depth, demosaic, looks_like_bayer
 from ..source import FrameSource, check_cut_short
 
 SIGNATURE = b"LUCAM-RECORDER"
@@ -38,9 +38,8 @@ TICKS_PER_SECOND = 10_000_000
 _MONO, _RGB, _BGR = 0, 100, 101
 _BAYER = {8: "rggb", 9: "grbg", 10: "gbrg", 11: "bggr"}
 _NAMES = {_MONO: "mono", _RGB: "rgb", _BGR: "bgr", **_BAYER}
-# Fewest pixels along a side from which the byte order is judged, and the share of the roughness in the order of the
-# header that the other order may have.
-_LEAST_SIDE, _SMOOTHER = 16, 0.6
+# Share of the roughness in the order of the header that the other order may have.
+_SMOOTHER = 0.6
 
 
 @dataclass(frozen=True)
@@ -169,7 +168,7 @@ def _as_pixels_say(path: Path, header: SerHeader) -> tuple[SerHeader, tuple[str,
 
 def _is_swapped(frame: PixelArray, full_scale: int) -> bool:
     """Whether an image is an image only with its bytes swapped."""
-    if min(frame.shape[:2]) < _LEAST_SIDE:
+    if min(frame.shape[:2]) < LEAST_SIDE:
         return False
     readings = (np.ascontiguousarray(frame), frame.byteswap())
     fits = [bool(values.max() <= full_scale) for values in readings]
