@@ -43,8 +43,7 @@ from .memory import Memory, remember, shown
 from .settings import SteadyParams
 from .windows import Window, iter_windows, relit
 
-# Median of the squared distance of points of a normal distribution from its centre in the plane, over the variance along
-# an axis.
+# Median of the squared distance from the centre of a normal distribution in the plane, over the variance along an axis.
 _MEDIAN_SQUARE = 2 * np.log(2)
 # Frames that the memory holds on average when the width of its blur is estimated, and frames over which the width that
 # is removed goes there, so that no frame is suddenly sharper.
@@ -158,7 +157,7 @@ class WindowWitnesses:
     """What the frames of a window say about their blur."""
 
     of_image: BlurWitnesses  # about that of an image fused from them
-    widest: float  # width that their displacement alone tells, pixels
+    usual: float  # median of the displacement by the air, as a variance along an axis, squared pixels
 
 
 def _find_first(window: Window, params: SteadyParams, runtime: Runtime) -> tuple[float, float, WindowWitnesses]:
@@ -178,16 +177,15 @@ def _find_witnesses(window: Window, image: FloatArray) -> WindowWitnesses:
     # The median leaves out objects, and flat parts, whose flow is arbitrary.
     own = np.stack([flow - camera_flow(fit_camera(flow, image.shape), image.shape, flow.shape) for flow in coarse])
     usual = float(np.median(np.square(own).sum(-1))) / _MEDIAN_SQUARE
-    widest = float(blur_posterior(None, BlurWitnesses(usual, count)).by_displacement[1])
-    return WindowWitnesses(measure_witnesses(frames, flows, image, BlurWitnesses(displacement, count)), widest)
+    return WindowWitnesses(measure_witnesses(frames, flows, image, BlurWitnesses(displacement, count)), usual)
 
 
 def _find_blur(image: FloatArray, said: WindowWitnesses, count: float, runtime: Runtime) -> tuple[float, float]:
     """Return width and exponent of the blur to remove from a mean of so many frames.
 
-    A window has few frames.  Where something moves or they are registered badly, they seem to vary, and the posterior is
-    too wide; where the scene is soft, so is what the image says.  Edges tell that nothing has blurred, and displacement
-    tells how much the air can have blurred.  The least of the three widths is removed.
+    A window has few frames.  Where something moves or they are registered badly, they seem to vary, and the posterior
+    is too wide; where the scene is soft, so is what the image says.  Edges tell that nothing has blurred, and the
+    usual displacement how much the air can have blurred.  The least of the three widths is removed.
     """
     grey, witnesses = luminance(image), said.of_image
     noise = white_noise(estimate_noise(grey))
@@ -198,7 +196,9 @@ def _find_blur(image: FloatArray, said: WindowWitnesses, count: float, runtime: 
     evidence, posterior = estimate_posterior(grey, witnesses, noise, runtime)
     if evidence is None:
         return 0.0, KOLMOGOROV
-    return min(posterior.removed, evidence.estimate.removable, said.widest), posterior.exponent
+    ratio = None if variation is None else variation.with_power(grey)
+    of_air = blur_posterior(evidence, replace(witnesses, displacement=said.usual), ratio).by_displacement[1]
+    return min(posterior.removed, evidence.estimate.removable, float(of_air)), posterior.exponent
 
 
 class _Scenes:
