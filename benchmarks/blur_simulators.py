@@ -168,7 +168,9 @@ def _photograph(side: int, rng: np.random.Generator) -> FloatArray:
     scale = max(float(rng.choice([0.5, 0.7, 1.0])), (side + 1) / min(grey.shape))
     grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
     y, x = (int(rng.integers(0, length - side + 1)) for length in grey.shape)
-    return grey[y : y + side, x : x + side]
+    part = grey[y : y + side, x : x + side]
+    # Some parts show nothing but the sea.
+    return part if part[MARGIN:-MARGIN, MARGIN:-MARGIN].std() > 0.02 else _photograph(side, rng)
 
 
 def _burn_in_title(images: list[FloatArray], rng: np.random.Generator) -> None:

@@ -45,6 +45,8 @@ INVISIBLE, WORST, UNIT = 10**-3.8, -8.0, 3.0
 WIDTHS = np.array([0, 0.35, 0.5, 0.7, 0.95, 1.25, 1.65, 2.2, 2.9, 3.9, 5.4, 7.5, 10.0])
 # Iterations that tell which blur is best; and a loss after which wider blurs are not tried, as a ratio of errors.
 ITERATIONS, HOPELESS = 8, 4.0
+# A blur that is wider than the widest by this factor is taken for hopeless.
+BEYOND = 1.5
 # Place of the width of the posterior among the features.
 USUAL = 10
 # Networks, their inner width, epochs, size of a batch, rate, decay of the weights, and share of units that are dropped.
@@ -300,9 +302,9 @@ def _row(title: str, clips: TrainingClips, held: np.ndarray, found: dict[int, Le
 
 def _gains_at(gains: np.ndarray, widths: np.ndarray) -> np.ndarray:
     """Gains (exponents, widths) on the grid of WIDTHS at other widths; those of a narrow blur grow as its square."""
-    logs = np.log(np.maximum(widths, WIDTHS[1]))
+    logs, known = np.log(np.maximum(widths, WIDTHS[1])), np.log([*WIDTHS[1:], BEYOND * WIDTHS[-1]])
     narrow = np.minimum(np.square(widths / WIDTHS[1]), 1)
-    return np.array([narrow * np.interp(logs, np.log(WIDTHS[1:]), row[1:]) for row in gains])
+    return np.array([narrow * np.interp(logs, known, [*row[1:], WORST]) for row in gains])
 
 
 def _gain(gains: np.ndarray, width: float, exponent: float) -> float:

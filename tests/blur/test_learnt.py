@@ -50,6 +50,14 @@ def test_the_better_exponent_is_removed():
         assert found.exponent == pytest.approx(1.6)
 
 
+@pytest.mark.parametrize(("exponent", "width"), [(EXPONENTS[0], 0.5), (EXPONENTS[1], 2.0), (1.0, 0.5)])
+def test_the_width_is_that_which_gains_with_a_given_exponent(exponent, width):
+    weights = networks_of(0.0, -1.0, 1.6, np.stack([peak_at(0.5, 1.0)[0], peak_at(2.0, 1.5)[0]]))
+    found = learnt_blur(np.zeros(FEATURES), 1.0, weights, exponent)
+    assert found.removed_exponent == found.exponent == exponent
+    assert found.removed == pytest.approx(width * np.exp(0.158 if width < 1 else 0), rel=0.05)
+
+
 def test_scatter_of_the_networks_widens_the_interval():
     weights = networks_of(0.0, np.log(0.2), 2.0, peak_at(1.0))
     narrow = learnt_blur(np.zeros(FEATURES), 1.0, weights).width

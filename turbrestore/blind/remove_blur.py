@@ -207,7 +207,8 @@ def find_blur(
     grey = luminance(image)
     if witnesses.picture is not None:
         grey = np.ascontiguousarray(grey[witnesses.picture])
-    evidence, posterior = estimate_posterior(grey, witnesses, noise or white_noise(estimate_noise(grey)), runtime)
+    noise = noise or white_noise(estimate_noise(grey))
+    evidence, posterior = estimate_posterior(grey, witnesses, noise, runtime, params.exponent)
     if evidence is None:
         return estimate_blur(image, exponent=params.exponent, runtime=runtime), posterior
     widest = min(WIDEST, min(grey.shape) / SIGMAS_A_SIDE)

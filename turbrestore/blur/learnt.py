@@ -112,9 +112,15 @@ def blur_features(
 
 
 def learnt_blur(
-    features: Float64Array, width: float, weights: Mapping[str, NDArray[np.floating]] | None = None
+    features: Float64Array,
+    width: float,
+    weights: Mapping[str, NDArray[np.floating]] | None = None,
+    exponent: float | None = None,
 ) -> LearntBlur:
-    """Evaluate the networks of the package, or others, where the posterior has a width in pixels."""
+    """Evaluate the networks of the package, or others, where the posterior has a width in pixels.
+
+    An ``exponent`` that is given is the only one that may be removed.
+    """
     weights = _weights() if weights is None else weights
     # What is not known is taken for usual.
     x = np.clip(np.nan_to_num((features - weights["middle"]) / weights["scale"]), -FARTHEST, FARTHEST)
@@ -127,12 +133,15 @@ def learnt_blur(
     quantiles = width * np.exp(out[:, 0].mean() + spread * np.array([-1.0, 0.0, 1.0]))
     gains = out[:, 3:].mean(axis=0).reshape(len(EXPONENTS), -1)
     gains = gains - gains[:, :1]
+    exponents, likeliest = EXPONENTS, float(np.clip(out[:, 2].mean(), 1, 2))
+    if exponent is not None:
+        share = np.clip((exponent - EXPONENTS[0]) / (EXPONENTS[1] - EXPONENTS[0]), 0, 1)
+        gains, exponents, likeliest = np.array([1 - share, share])[None] @ gains, (exponent,), exponent
     best = int(gains.max(axis=1).argmax())
-    exponent = float(np.clip(out[:, 2].mean(), 1, 2))
     if gains[best].max() <= _SEEN:
-        return LearntBlur(quantiles, exponent, 0.0, exponent)
+        return LearntBlur(quantiles, likeliest, 0.0, likeliest)
     removed = width * _widest(gains[best], float(quantiles[1]) / width)
-    return LearntBlur(quantiles, exponent, removed, EXPONENTS[best])
+    return LearntBlur(quantiles, likeliest, removed, exponents[best])
 
 
 def _widest(gains: Float64Array, most: float) -> float:

@@ -134,9 +134,16 @@ def measure_witnesses(frames: FloatArray, flows: FloatArray, mean: FloatArray, k
 
 
 def estimate_posterior(
-    image: FloatArray, witnesses: BlurWitnesses, noise: NoiseSpectrum, runtime: Runtime = DEFAULT
+    image: FloatArray,
+    witnesses: BlurWitnesses,
+    noise: NoiseSpectrum,
+    runtime: Runtime = DEFAULT,
+    exponent: float | None = None,
 ) -> tuple[ImageEvidence | None, BlurPosterior]:
-    """Estimate the blur of an image (H, W) of some noise; none is removed where the image shows nothing."""
+    """Estimate the blur of an image (H, W) of some noise; none is removed where the image shows nothing.
+
+    ``exponent`` is that of the transfer function, if it is given.
+    """
     evidence, variation = image_evidence(image, runtime), witnesses.variation
     ratio = None if variation is None else variation.with_power(image)
     by_theory = blur_posterior(evidence, witnesses, ratio)
@@ -145,7 +152,7 @@ def estimate_posterior(
     widths = [by_theory.by_displacement, by_theory.by_variation, by_theory.by_image, by_theory.width]
     facts = by_theory.air, by_theory.exponent, witnesses.displacement, witnesses.independent_frames
     features = blur_features(image, np.array(widths), variation, ratio, evidence, noise, facts)
-    found = learnt_blur(features, float(by_theory.width[1]))
+    found = learnt_blur(features, float(by_theory.width[1]), exponent=exponent)
     highest, transfer, lowest = (radial_otf(by_theory.frequencies, width, found.exponent) for width in found.width)
     return evidence, replace(
         by_theory,
