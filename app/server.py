@@ -26,6 +26,7 @@ from .tab import Tab
 if TYPE_CHECKING:
     import uvicorn
     from fastapi import Response
+    from nicegui import Client
 
 HOST = "127.0.0.1"
 # Seconds that open connections have at the end.
@@ -96,25 +97,28 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
     from nicegui import app, ui
 
     # Tab and page of every tab of the browser, which keeps its name when the page is loaded again.
-    shown: dict[str, tuple[Tab, str]] = {}
+    shown: dict[str, tuple[Tab, Client]] = {}
 
     @ui.page("/", title="turbrestore", reconnect_timeout=_ABSENCE)
     async def page() -> None:
         await _show(shown, tabs, folders, file)
 
+    # A busy browser may ask late for what newer images have replaced; that is no error, so its answer is an empty one.
     @app.get("/pictures/{key}/{name}", response_class=Response)
     def picture(key: str, name: str) -> Response:
-        data = next((tab.pictures.get(name) for tab in tuple(tabs) if secrets.compare_digest(tab.key, key)), None)
+        tab = _find(tabs, key)
+        data = None if tab is None else tab.pictures.get(name)
         if data is None:
-            return Response(status_code=404)
+            return Response(status_code=404 if tab is None else 204)
         return Response(data, media_type="image/png", headers={"Cache-Control": "no-store"})
 
     @app.get("/videos/{key}/{name}", response_class=Response)
     def video(key: str, name: str) -> Response:
-        found = next((tab.steadied for tab in tuple(tabs) if secrets.compare_digest(tab.key, key)), None)
-        if found is None or not found.film_path.is_file():
-            return Response(status_code=404)
-        return FileResponse(found.film_path, media_type="video/mp4", headers={"Cache-Control": "no-store"})
+        tab = _find(tabs, key)
+        film = None if tab is None else tab.films.get(name)
+        if film is None:
+            return Response(status_code=404 if tab is None else 204)
+        return FileResponse(film, media_type="video/mp4", headers={"Cache-Control": "no-store"})
 
     def stop_all() -> None:
         for tab in tabs:
@@ -138,7 +142,11 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
     return uvicorn.Server(config)
 
 
-async def _show(shown: dict[str, tuple[Tab, str]], tabs: set[Tab], folders: Folders, file: Path | None) -> None:
+def _find(tabs: set[Tab], key: str) -> Tab | None:
+    return next((tab for tab in tuple(tabs) if secrets.compare_digest(tab.key, key)), None)
+
+
+async def _show(shown: dict[str, tuple[Tab, Client]], tabs: set[Tab], folders: Folders, file: Path | None) -> None:
     """Show a tab of the browser what it had before it was loaded again, or a new page."""
     from nicegui import app, ui
 
@@ -151,15 +159,22 @@ async def _show(shown: dict[str, tuple[Tab, str]], tabs: set[Tab], folders: Fold
     # The browser may have left before it had the page.
     if name is None:
         return
-    tab = shown[name][0] if name in shown else Tab(folders)
-    shown[name] = tab, client.id
+    tab, earlier = shown.get(name, (None, None))
+    if earlier is not None:
+        # The page before goes no further; its images would take the places of those of this one.
+        earlier.remove_all_elements()
+    tab = tab or Tab(folders)
+    shown[name] = tab, client
     tabs.add(tab)
 
     async def leave() -> None:
         # Any page that is still on its way to a busy browser may be this tab, loaded again.
-        while any(not each.has_socket_connection for each in app.clients("/")):
+        expected = True
+        while expected:
+            expected = any(not each.has_socket_connection for each in app.clients("/"))
+            # A page that has just been connected has not told its tab yet.
             await asyncio.sleep(_BEAT)
-        if shown.get(name) == (tab, client.id):
+        if shown.get(name) == (tab, client):
             del shown[name]
             tabs.discard(tab)
             threading.Thread(target=tab.close).start()

@@ -91,7 +91,7 @@ def steady_order(order: SteadyOrder, job: Job[object], film_path: Path) -> Stead
     job : Job
         Hears of every frame.
     film_path : Path
-        Where the film goes, .mp4; an earlier one is replaced.
+        Where the film goes, .mp4.
 
     Returns
     -------
@@ -111,7 +111,6 @@ def steady_order(order: SteadyOrder, job: Job[object], film_path: Path) -> Stead
     write_video(order.output, images, fps, source.bit_depth, order.overwrite, encoding, companion=source)
     write_settings(order.settings, settings_record(machine, order.selection, order.params, order.written))
     count = film_length(len(source), *source.shape[1:3])
-    film_path.unlink(missing_ok=True)
     film = write_film(film_path, _pairs(source, order.output, count, job), count, fps, _RATE_FACTOR)
     job.message = f"Verdict: {figures.verdict}."
     return Steadied(order.output, film, film_path)

@@ -6,6 +6,7 @@ import dataclasses
 import secrets
 import tempfile
 from collections.abc import Callable, Sequence
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
 
@@ -54,6 +55,8 @@ class Tab:
         What was ordered last of the clip, as the form says it.
     steadied : Steadied or None
         The newest steadied video of the clip.
+    films : dict of str to Path
+        Files of the films that the page may ask for, by their names.
     rows : list of Row
         What becomes of several clips.
     closed : bool
@@ -70,9 +73,11 @@ class Tab:
         self.tuned: DeconvolutionParams | None = None
         self.border: Literal["keep", "crop"] = "keep"
         self.steadied: Steadied | None = None
+        self.films: dict[str, Path] = {}
         self.rows: list[Row] = []
         self.closed = False
         self._opening = 0
+        self._film_numbers = count(1)
         self._own: tempfile.TemporaryDirectory[str] | None = None
 
     @property
@@ -151,7 +156,7 @@ class Tab:
 
     def steady(self, order: SteadyOrder) -> Job[Steadied]:
         """Steady the clip in a thread; the video becomes that of the tab when it is done."""
-        film = self._folder() / ".film.mp4"
+        film = self._next_film()
 
         def work(job: Job[Steadied]) -> Steadied:
             steadied = steady_order(order, job, film)
@@ -176,7 +181,7 @@ class Tab:
             self.job.stop()
 
     def close(self) -> None:
-        """End the run and remove what was uploaded, and the film."""
+        """End the run and remove what was uploaded, and the films."""
         self.closed = True
         self.stop()
         if self.job is not None:
@@ -190,6 +195,17 @@ class Tab:
         if self._own is None:
             self._own = tempfile.TemporaryDirectory(prefix="turbrestore-")
         return Path(self._own.name)
+
+    def _next_film(self) -> Path:
+        """Return where the next film goes; the one that is shown stays, and older ones are removed."""
+        shown = None if self.steadied is None else self.steadied.film_path
+        for name, path in tuple(self.films.items()):
+            if path != shown:
+                del self.films[name]
+                path.unlink(missing_ok=True)
+        path = self._folder() / f".film{next(self._film_numbers)}.mp4"
+        self.films[path.name] = path
+        return path
 
     def _start(self, kind: Kind, work: Callable[[Job[Result]], Result]) -> Job[Result]:
         self.stop()

@@ -62,10 +62,11 @@ class SimulatedClip:
     truth: FloatArray
 
 
-def simulate(seed: int) -> SimulatedClip:
-    """Draw everything about a clip from a seed."""
+def simulate(seed: int, simulator: str | None = None) -> SimulatedClip:
+    """Draw everything about a clip from a seed, unless the simulator is given."""
     rng = np.random.default_rng(seed)
-    simulator = str(rng.choice(list(SHARES), p=list(SHARES.values())))
+    drawn = str(rng.choice(list(SHARES), p=list(SHARES.values())))
+    simulator = simulator or drawn
     side = int(rng.integers(168, 224)) if simulator in ("near", "close") else int(rng.integers(112, 177))
     name = str(rng.choice(list(SCENES), p=list(SCENES.values())))
     scene = draw_scene(name, side + 2 * MARGIN, rng)
@@ -140,7 +141,9 @@ def _bars(side: int, rng: np.random.Generator) -> FloatArray:
 def _craters(side: int, rng: np.random.Generator) -> FloatArray:
     """Rough ground with craters of all sizes, lit from low above."""
     nu = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.fftfreq(side))
-    rough = np.fft.ifft2(np.fft.fft2(rng.standard_normal((side, side))) * (nu + 1 / side) ** -rng.uniform(1.4, 2.2)).real
+    rough = np.fft.ifft2(
+        np.fft.fft2(rng.standard_normal((side, side))) * (nu + 1 / side) ** -rng.uniform(1.4, 2.2)
+    ).real
     height = rng.uniform(0.5, 3) * rough / rough.std()
     y, x = np.mgrid[:side, :side]
     for _ in range(int(rng.choice([20, 80, 300]))):
@@ -187,7 +190,7 @@ def _burn_in_title(images: list[FloatArray], rng: np.random.Generator) -> None:
     for image in images:
         if box:
             image[max(base - down - 4, 0) : base + 5, max(left - 3, 0) : left + across + 4] = 0.05
-        image += share * (0.95 - image)
+        image[...] += share * (0.95 - image)
 
 
 def _screens(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -239,7 +242,7 @@ def _speckles(width: float, rng: np.random.Generator) -> FloatArray:
 def _lens(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     blurred = _optics(scene, float(np.exp(rng.uniform(np.log(0.4), np.log(7)))), rng)
     flows = _flows(count, scene.shape, rng)
-    if rng.uniform() < 0.25:
+    if rng.uniform() < 0.5:
         flows = np.zeros_like(flows)
     # A lens blurs what the air has moved; what the air has blurred moves.
     return _moved(scene, [blurred] * count, flows)
@@ -333,7 +336,7 @@ def _wandering(
 
 def record(frames: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Frames as a camera keeps them: noise, its reduction or sharpening, H.264 or HEVC, eight bits."""
-    noise = float(np.exp(rng.uniform(np.log(0.001), np.log(0.06))))
+    noise = float(np.exp(rng.uniform(np.log(0.0005), np.log(0.06))))
     level = np.sqrt(np.maximum(frames, 0.02)) / 0.7 if rng.uniform() < 0.4 else 1.0
     kind, grain = str(rng.choice(["white", "smooth", "reduced"], p=[0.6, 0.2, 0.2])), rng.standard_normal(frames.shape)
     if kind == "smooth":

@@ -24,7 +24,7 @@ from unittest.mock import patch
 import numpy as np
 import torch
 from blur_calibration import CORE, registered
-from blur_simulators import SimulatedClip, simulate
+from blur_simulators import SHARES, SimulatedClip, simulate
 from provenance import publish
 
 from turbrestore import DeconvolutionParams, TurbrestoreError, pipeline
@@ -66,11 +66,12 @@ def main() -> int:
         kind.add_argument("folder", type=Path)
     make.add_argument("first", type=int)
     make.add_argument("last", type=int)
+    make.add_argument("--simulator", choices=SHARES)
     train.add_argument("--write", type=Path)
     given = parser.parse_args()
     if given.what == "make":
         given.folder.mkdir(exist_ok=True)
-        make_clips(given.folder, given.first, given.last)
+        make_clips(given.folder, given.first, given.last, given.simulator)
         return 0
     clips = read_clips(given.folder)
     publish(table_of(clips), given.write)
@@ -79,13 +80,13 @@ def main() -> int:
     return 0
 
 
-def make_clips(folder: Path, first: int, last: int) -> None:
+def make_clips(folder: Path, first: int, last: int, simulator: str | None) -> None:
     """Simulate clips, and keep what is known of each in a file of the folder."""
     for seed in range(first, last):
-        path = folder / f"{seed}.pkl"
+        path = folder / f"{simulator or 'any'}_{seed}.pkl"
         if not path.exists():
             begun = time.perf_counter()
-            clip = simulate(seed)
+            clip = simulate(seed, simulator)
             found = known_of(clip)
             partial = path.with_suffix(".part")
             partial.write_bytes(pickle.dumps({"seed": seed, "simulator": clip.simulator, "scene": clip.scene, **found}))

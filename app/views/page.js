@@ -53,7 +53,8 @@ window.turbrestore = (() => {
     async replace(key, address) {
       const next = new Image();
       next.src = address;
-      await next.decode();
+      // A newer image has replaced it already where the server no longer has it.
+      if (!await next.decode().then(() => true, () => false)) return;
       const shown = document.querySelector(`#compare .layer[data-key="${key}"] img`);
       if (!shown) return;
       markups.compare = markups.compare.replace(shown.getAttribute("src"), address);

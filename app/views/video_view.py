@@ -35,8 +35,7 @@ class VideoView:
         if found is None:
             ui.run_javascript('turbrestore.fill("video", "")')
             return
-        # The address of another film is another one, so that the browser does not show the one before.
-        address = f"videos/{self._tab.key}/{found.film_path.stat().st_mtime_ns}.mp4"
+        address = f"videos/{self._tab.key}/{found.film_path.name}"
         ui.run_javascript(f'turbrestore.fill("video", {json.dumps(film_comparison(found.film, address))})')
         name = printable(self._tab.folders.shown(found.video.resolve()))
         self._note.text = f"{name}, {found.film.count} frames beside the input"

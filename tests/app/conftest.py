@@ -22,8 +22,10 @@ EVIL = "<img src=x onerror=document.title='taken'>.mkv"
 SAMPLE = Path(__file__).parents[2] / "sample_data" / "chart.mkv"
 # Of the sample clip, x, y, width, height: larger than what a preview shows.
 PART = (32, 24, 192, 144)
-# Seconds until a run must have ended, on a machine that does other things too.
+# Milliseconds until a run must have ended, on a machine that does other things too.
 LONG = 60_000
+# No image of the page is one that the server does not have.
+COMPLETE = "[...document.images].every((image) => !image.getAttribute('src') || image.naturalWidth > 0)"
 
 
 class App:
@@ -98,6 +100,7 @@ def open_tab(window, app):
         page = window.new_page()
         pages.append(page)
         page.on("console", lambda message: complaints.append(message.text))
+        page.on("response", lambda answer: answer.status >= 400 and complaints.append(f"{answer.status} {answer.url}"))
         page.on("pageerror", lambda error: complaints.append(str(error)))
         page.on("request", lambda request: addresses.append(request.url))
         page.on("websocket", lambda opened: addresses.append(opened.url.replace("ws://", "http://")))
@@ -107,8 +110,10 @@ def open_tab(window, app):
 
     yield open_one
     for page in pages:
+        if not page.is_closed():
+            page.wait_for_function(COMPLETE)
         page.close()
-    assert complaints == []
+    assert not complaints, "\n".join(complaints)
     assert [address for address in addresses if not address.startswith((app.address, "data:", "blob:"))] == []
 
 

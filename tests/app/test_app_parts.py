@@ -6,6 +6,7 @@ import shlex
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -366,13 +367,16 @@ def test_pages_of_one_tab_leave_in_any_order(monkeypatch, tmp_path):
     async def nothing(*_):
         """Stand in for what needs a browser."""
 
-    shown, tabs, left, on_their_way = {}, set(), [], []
+    shown, tabs, left, on_their_way, emptied = {}, set(), [], [], []
     monkeypatch.setattr(page, "add_styles_and_scripts", lambda: None)
     monkeypatch.setattr(page, "Page", lambda _: SimpleNamespace(show=nothing))
     monkeypatch.setattr(app, "clients", lambda _: on_their_way)
 
     async def show(client_id):
-        client = SimpleNamespace(tab_id="tab", id=client_id, connected=nothing, on_delete=left.append)
+        empty = partial(emptied.append, client_id)
+        client = SimpleNamespace(
+            tab_id="tab", id=client_id, connected=nothing, on_delete=left.append, remove_all_elements=empty
+        )
         monkeypatch.setattr(ui, "context", SimpleNamespace(client=client))
         await server._show(shown, tabs, Folders(tmp_path), None)
 
@@ -385,8 +389,8 @@ def test_pages_of_one_tab_leave_in_any_order(monkeypatch, tmp_path):
         await show("second")
         on_their_way.clear()
         await leaving
-        # A page that is loaded slowly finds its tab again.
-        assert tabs == before
+        # A page that is loaded slowly finds its tab again, and the one before goes no further.
+        assert (tabs, emptied) == (before, ["first"])
         for leave in reversed(left):
             await leave()
         assert not shown and not tabs

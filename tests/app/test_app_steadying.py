@@ -70,6 +70,13 @@ class TestSteady:
         assert main([*command[1:], "--quiet"]) == 0
         for suffix in (".mp4", ".mp4.toml"):
             assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
+        # A page may still play the film of the video before.
+        films = [tab.steadied.film_path]
+        for _ in range(2):
+            assert ended(tab.steady(replace(order, overwrite=True))).state == "done"
+            films.append(tab.steadied.film_path)
+        assert [film.exists() for film in films] == [False, True, True]
+        assert tab.films == {film.name: film for film in films[1:]}
         with pytest.raises(OutputError, match="exists already"):
             order.check()
         with pytest.raises(ConfigurationError, match=r"ends in \.mp4"):

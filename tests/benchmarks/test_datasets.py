@@ -123,14 +123,6 @@ class TestLayout:
         assert datasets.main([name, str(tmp_path / "none")]) == 66
 
 
-def test_levels_of_turbulence_have_means_of_their_own(clip, tmp_path, capsys):
-    atsyn_dynamic(tmp_path, clip)
-    assert datasets.main(["atsyn-dynamic", str(tmp_path), "--json", str(tmp_path / "f.json")]) == 0
-    figures = json.loads((tmp_path / "f.json").read_text())
-    assert [*figures] == ["a.mp4", "b.mp4", "mean, weak", "mean, strong", "mean"]
-    assert "| mean, weak |" in capsys.readouterr().out
-
-
 def test_the_ends_of_a_video_do_not_count(clip, tmp_path):
     truth = np.repeat(clip.scene[None], 8, axis=0)
     spoilt = truth.copy()
@@ -151,27 +143,6 @@ def test_results_are_written_for_the_recognisers_of_others(clip, tmp_path):
     with pytest.raises(datasets.OutputError, match="exists already"):
         datasets.score_folder("turbulence-text", tmp_path / "in", out=tmp_path / "out")
     assert result.read_bytes() == b"mine"
-
-
-def test_clips_of_one_stem_have_a_row_each(clip, tmp_path):
-    for suffix in ("mkv", "npy"):
-        write_video(tmp_path / f"van.{suffix}", clip.frames, fps=25)
-    assert [sample.name for sample in datasets.DATASETS["clear"](tmp_path)] == ["van.mkv", "van.npy"]
-
-
-@pytest.mark.parametrize("text", ["{", "[1]", '{"0": {"video_name": "a.mp4"}}'])
-def test_a_damaged_list_of_videos_is_told(clip, tmp_path, capsys, text):
-    (tmp_path / "test_info.json").write_text(text)
-    assert datasets.main(["atsyn-dynamic", str(tmp_path)]) == 65
-    error = capsys.readouterr().err
-    assert "test_info.json: expected videos" in error and error.count("\n") == 1
-
-
-def test_a_missing_frame_is_told(clip, tmp_path):
-    atsyn_static(tmp_path, clip)
-    (tmp_path / "Places_1" / "turb" / "20.png").unlink()
-    with pytest.raises(datasets.DataError, match="frames 15 to 34, found none called 20"):
-        datasets.score_folder("atsyn-static", tmp_path)
 
 
 @pytest.mark.parametrize("channels", [1, 3])

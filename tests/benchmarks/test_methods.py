@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from methods.diffeomorphic import deblurred_template, template
-from methods.low_rank import LowRankParams, decompose, low_rank_image, register_to_mean
+from methods.diffeomorphic import template
+from methods.low_rank import decompose, low_rank_image
 from methods.sobolev import SobolevParams, latent_image, sobolev_flow, sobolev_latent_image
 
 from conftest import make_sequence
@@ -41,11 +41,6 @@ class TestEveryMethod:
 
 
 class TestSobolevFlow:
-    def test_mirrored_frames_give_mirrored_frames(self, clip):
-        flow = sobolev_flow(clip.frames)
-        np.testing.assert_allclose(sobolev_flow(clip.frames[:, :, ::-1]), flow[:, :, ::-1], atol=2e-4)
-        np.testing.assert_allclose(sobolev_flow(clip.frames[::-1]), flow[::-1], atol=2e-4)
-
     def test_without_sharpening_it_diffuses_in_time_alone(self):
         # Frames that differ by a constant keep their gradients, which is all that α = 1 asks for.
         frames = np.repeat(np.array([0.0, 0.0, 1.0, 0.0, 0.0], np.float32)[:, None, None], 32, axis=1)
@@ -63,14 +58,6 @@ class TestSobolevFlow:
         sharpened = sobolev_flow(still, SobolevParams(sharpening=2.0, steps=60, time_step=0.3))
         assert energy(sharpened) / energy(still) == pytest.approx(2.0, abs=0.1)
 
-    def test_the_best_region_of_every_place_is_taken(self, clip):
-        frames = np.stack([clip.scene, clip.scene, clip.scene])
-        frames[0, :48] += 0.3
-        frames[1, 48:] += 0.3
-        image = latent_image(frames, SobolevParams(variance_weight=0.0))
-        assert np.abs(image - clip.scene)[:32].max() < 1e-5
-        assert np.abs(image - clip.scene)[-32:].max() < 1e-5
-
 
 class TestLowRank:
     def test_the_three_parts_are_told_apart_and_sum_up(self):
@@ -86,24 +73,11 @@ class TestLowRank:
         assert o[objects > 0].min() > 0.3
         assert np.abs(o[objects == 0]).mean() < 0.01
 
-    def test_registered_frames_differ_less(self, clip):
-        registered = register_to_mean(clip.frames, LowRankParams(passes=2))
-        inside = np.s_[:, 8:-8, 8:-8]
-        assert registered[inside].std(axis=0).mean() < 0.7 * clip.frames[inside].std(axis=0).mean()
-
 
 class TestTemplate:
-    def test_it_does_not_depend_on_the_frame_that_is_the_reference(self, clip):
-        images = [compare(template(clip.frames, reference=number), clip.scene).psnr for number in (0, 5, 9)]
-        assert np.ptp(images) < 1.0
-
     def test_the_geometry_is_that_of_the_mean_not_of_the_reference(self, clip):
         moved = np.roll(clip.scene, 3, axis=1)
         frames = np.stack([moved, clip.scene, np.roll(clip.scene, -3, axis=1)])
         image = template(frames)
         inside = np.s_[16:-16, 16:-16]
         assert np.abs(image - clip.scene)[inside].mean() < 0.3 * np.abs(moved - clip.scene)[inside].mean()
-
-    def test_deblurring_pays(self, clip):
-        fused, deblurred = deblurred_template(clip.frames)
-        assert compare(deblurred, clip.scene).psnr > compare(fused, clip.scene).psnr

@@ -1,19 +1,13 @@
 """The table of methods: every method runs, figures land in the right cells, and a lead of others is printed."""
 
-import importlib
 import json
-import subprocess
 import sys
-import zipfile
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import peers
 import pytest
-from methods.packages import NETWORK, STACKERS, PackageError, make_environment, run_package
-from methods.usage import peak_megabytes
+from methods.packages import NETWORK, PackageError, run_package
 from peer_tables import document
 from peer_videos import moving_square, score_video
 from provenance import LINE
@@ -55,55 +49,6 @@ def test_a_package_that_fails_is_left_out_with_its_reason(folder, tmp_path):
         run_package("pystackreg", np.zeros((2, 8, 8), np.float32), Path(sys.executable))
 
 
-def test_an_environment_that_cannot_be_made_gives_its_reason(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(PackageError, match="cannot be made"):
-        make_environment(replace(STACKERS, folder=tmp_path / "file" / "environment"))
-
-
-def test_a_network_sees_every_frame_and_pixel_once(tmp_path, monkeypatch):
-    """Of windows, tiles and padding nothing is left where the network returns what it is given."""
-    seen = []
-
-    class Identity:
-        def __init__(self, weights, options, providers):
-            assert weights == b"weights"
-
-        def run(self, _, given):
-            planes = given["input"]
-            seen.append(planes.shape)
-            assert planes.dtype == np.float16 and planes.shape[1] % 3 == 0
-            # Red, green and blue of a frame lie beside each other.
-            colours = planes.reshape(-1, 3, *planes.shape[2:])
-            assert not np.any(colours[:, 0] - colours[:, 2])
-            return [planes]
-
-    monkeypatch.syspath_prepend(BENCHMARKS / "methods")
-    fake = SimpleNamespace(InferenceSession=Identity, SessionOptions=SimpleNamespace)
-    monkeypatch.setitem(sys.modules, "onnxruntime", fake)
-    monkeypatch.setattr(sys, "prefix", str(tmp_path))
-    with zipfile.ZipFile(tmp_path / "vs_undistort-2.3.1-py3-none-any.whl", "w") as packed:
-        packed.writestr("vs_undistort/models/UNet3d_TMT_cub_op19_fp16.onnx", b"weights")
-    child = importlib.import_module("package_child")
-    frames = np.random.default_rng(0).random((13, 70, 300), dtype=np.float32)
-    for given in (frames, np.stack([frames] * 3, axis=-1)):
-        made = []
-        child.tmt_detilting(given, tmp_path, made.append)
-        np.testing.assert_allclose(made[0], given, atol=5e-4)
-    assert set(seen) == {(1, 30, 128, 256)}
-    # Windows and tiles cover what they are parts of.
-    for length, overlap in ((40, 0), (41, 16), (300, 16), (1000, 16)):
-        begins = child.starts(length, 40, overlap)
-        assert begins[0] == 0 and begins[-1] + 40 == length and max(np.diff(begins), default=0) <= 40 - overlap
-
-
-def test_the_memory_of_the_parent_is_not_counted():
-    command = [sys.executable, "-c", "import usage; print(usage.peak_megabytes())"]
-    ballast = np.ones(20_000_000)
-    peak = float(subprocess.run(command, cwd=BENCHMARKS / "methods", capture_output=True, check=True).stdout)
-    assert np.isnan(peak) or peak < ballast.nbytes / 1e6 < peak_megabytes()
-
-
 FIGURES = {"psnr": 20.0, "psnr_sharp": 25.0, "ssim": 0.5, "ssim_sharp": 0.6}
 SPENT = {"seconds": 1.0, "deblurring": 0.5, "peak": 100.0}
 
@@ -125,10 +70,6 @@ class TestDocument:
     def test_a_lead_of_another_method_is_printed(self):
         assert "- a: mean 25.40; turbrestore 25.00 dB" in self.document(psnr_sharp=25.4)
 
-    def test_a_lead_is_followed_by_where_it_arises(self):
-        assert "Before deblurring mean is 1.00 dB ahead already" in self.document(psnr=21.0, psnr_sharp=25.4)
-        assert "Before deblurring mean is 1.00 dB behind" in self.document(psnr=19.0, psnr_sharp=25.4)
-
     def test_a_network_has_a_table_and_spoils_no_mean_where_it_did_not_run(self):
         drawn, other = "drawn_air_page", "quick_chart"
         found = {**FIGURES, **SPENT}
@@ -147,9 +88,6 @@ class TestDocument:
         text = document({}, {}, {}, {"road": methods})
         assert "| mean | 22.00 | – | – | – |" in text
         assert "Ahead of turbrestore in PSNR: mean." in text
-
-    def test_less_than_the_least_lead_is_none(self):
-        assert "On no clip." in self.document(psnr_sharp=25.04)
 
 
 def test_videos_are_scored_frame_by_frame():

@@ -165,15 +165,6 @@ class TestBatch:
         code, _, err = run(*words, "--resume", "--bit-depth", "16")
         assert code == 0 and "3 of 3: " in err and contents(out)["0.png"] != first["0.png"]
 
-    def test_what_the_clips_share_is_not_replaced(self, run, clips, tmp_path):
-        write_image(tmp_path / "0.png", np.eye(64, dtype=np.float32))
-        before = contents(tmp_path)
-        code, _, err = run(
-            clips / "1.mkv", clips / "0.mkv", "--out", tmp_path, "--static-mask", tmp_path / "0.png", "--overwrite"
-        )
-        assert code == 73 and "0.png: is an input" in err
-        assert contents(tmp_path) == before
-
     def test_what_others_made_is_not_replaced(self, run, clips, tmp_path):
         (tmp_path / "0.png").touch()
         for words in ([], ["--resume"]):

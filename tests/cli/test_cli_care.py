@@ -96,72 +96,7 @@ class TestHelp:
         assert {"whole_sample", "sharp.png", "all.png", "tv.png", "haze.flow.npy", "more.mkv", "run.toml"} <= made
 
 
-@pytest.mark.parametrize(
-    ("words", "part"),
-    [
-        (["restor"], 'Did you mean "restore"'),
-        (["moments", "miror"], 'Did you mean "mirror"'),
-        (["restore", "a.mkv", "b.png", "--sigm", "1"], "Did you mean --sigma?"),
-        (["register", "a.mkv", "b.mkv", "--verbose"], "Unknown option: --verbose.\n"),
-        (["restore", "-a.mkv", "b.png"], "-a.mkv: taken for an option; write ./-a.mkv, or -- before the paths"),
-        (["steady", "a.mkv", "b.mkv", "--quiet", "--verbose"], "--verbose: contradicts --quiet"),
-        (["synthesize", "chart", "b.mkv", "--strenght", "weak"], "Did you mean --strength?"),
-        (["restore", "a.mkv", "b.png", "--flow.method", "tvl2"], 'Did you mean "tvl1"?'),
-        (["restore", "a.mkv", "b.png", "c.png"], "c.png: one word too many"),
-        (["config"], "--init FILE or --check FILE"),
-        (["config", "--init", "a.toml", "--check", "a.toml"], "--init FILE or --check FILE"),
-        (["config", "--init", "a.txt"], ".toml"),
-        (["config", "--check", "a.toml", "--overwrite"], "--overwrite"),
-        (["--install-completion", "--shell", "fsh"], 'Did you mean "fish"?'),
-    ],
-    ids=" ".join,
-)
-def test_errors_are_one_line_that_suggests(run, tmp_path, monkeypatch, words, part):
-    monkeypatch.chdir(tmp_path)
-    code, out, err = run(*words)
-    assert (code, out, err.count("\n")) == (2, "", 1)
-    assert part in err
-    assert list(tmp_path.iterdir()) == []
-
-
 class TestSettings:
-    @pytest.mark.parametrize(
-        ("text", "part"),
-        [
-            ("trian = 3\n", "trian is no setting; did you mean train?"),
-            ("[flow]\nmetod = 'dis'\n", "flow.metod is no setting; did you mean flow.method?"),
-            ("[flwo]\nmethod = 'dis'\n", "flwo is no setting; did you mean flow?"),
-            ("fidelty = 3\n", "did you mean deconvolution.fidelity?"),
-            ("qqq = 3\n", "turbrestore config --init"),
-            ("flow = 'dis'\n", "flow: expected a section [flow], found 'dis'"),
-            ("[train]\n", "train: expected a value, found a section"),
-            ("report = 'a.html'\n", "report belongs on the command line"),
-            ("[flow]\nmethod = 'tvl2'\n", 'Did you mean "tvl1"?'),
-            ("train = 'x'\n", "run.toml: train: expected a whole number"),
-            ("train = 1\n", "train: expected 2 frames or more"),
-            ("roi = '3'\n", "--roi"),
-            ("bit_depth = 20\n", "bit_depth"),
-            ("sigma = 1e999\n", "sigma: expected"),
-            ("sigma = 1\n[deconvolution]\nsigma = 2\n", "contradicts"),
-        ],
-    )
-    def test_what_is_wrong_is_said_and_nothing_done(self, run, tmp_path, text, part):
-        path = tmp_path / "run.toml"
-        path.write_text(text)
-        for words in (["config", "--check", path], ["restore", ROOT / "sample_data/chart.mkv", tmp_path / "o.png"]):
-            options = ["--config", path] if words[0] == "restore" else []
-            code, out, err = run(*words, *options)
-            assert (code, out, err.count("\n")) == (2, "", 1)
-            assert part in err
-        assert list(tmp_path.iterdir()) == [path]
-
-    @pytest.mark.parametrize("text", ["a = " + "[" * 100_000, "train = " + "9" * 6000], ids=["nested", "digits"])
-    def test_what_python_does_not_read_is_said(self, run, tmp_path, text):
-        (tmp_path / "run.toml").write_text(text)
-        code, out, err = run("config", "--check", tmp_path / "run.toml")
-        assert (code, out, err.count("\n")) == (2, "", 1)
-        assert "run.toml: expected settings as TOML" in err
-
     def test_written_file_is_what_a_restoration_without_it_uses(self, run, folder):
         write_video("small.mkv", open_frames("sample_data/chart.mkv", roi=(16, 8, 64, 64)).read(0, 4), 25)
         assert run("config", "--init", "run.toml")[0] == 0

@@ -59,24 +59,6 @@ class TestMirror:
         assert record["plant_unknown"]["bounds"] == {}
 
 
-@pytest.mark.parametrize(
-    ("words", "part"),
-    [
-        (["wavefront", "--seeds", 1], "--seeds"),
-        (["wavefront", "--seeds", 2.5], "whole number"),
-        (["wavefront", "--slope-disturbance", 0], "--slope-disturbance"),
-        (["mirror", "--seeds", 0], "--seeds"),
-        (["mirror", "--deviation", 9], "--deviation"),
-    ],
-)
-def test_refused_in_one_line(run, words, part):
-    code, out, err = run(*words)
-    assert (code, out) == (2, "")
-    assert err.startswith("turbrestore: ")
-    assert err.count("\n") == 1
-    assert part in err
-
-
 def test_help_loads_no_numbers():
     code = "import turbrestore_cli.__main__ as m, sys; m.main(['moments', '--help']); print('numpy' in sys.modules)"
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout

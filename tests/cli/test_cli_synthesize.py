@@ -133,17 +133,8 @@ def test_colour_picture_of_the_users_own(run, tmp_path):
 
 @pytest.mark.parametrize("exposure", [[], ["--exposure", "0.03", "--sub-frames", "3"]])
 def test_dynamic_texture_continues_a_clip(run, clip, tmp_path, exposure):
-    words = [
-        "--model",
-        "dynamic-texture",
-        "--like",
-        clip,
-        "--frames",
-        "20",
-        "--quiet",
-        "--dynamic-texture.fit",
-        "mirror",
-    ]
+    words = ["--model", "dynamic-texture", "--like", clip, "--frames", "20", "--quiet"]
+    words += ["--dynamic-texture.fit", "mirror"]
     code, _, err = run("chart", tmp_path / "t.mkv", *words, "--size", "96x72", *exposure, "--read-noise", "0.002")
     assert code == 0, err
     assert names(tmp_path) == {"t.mkv", "t.truth.png", "t.flow.npy", "t.json"}
@@ -173,16 +164,8 @@ def test_progress_counts_the_flows_of_the_clip_and_the_frames(run, clip, tmp_pat
     assert run("chart", tmp_path / "a.npy", *QUICK)[0] == 0
     assert calls == [("synthesize", done, 3) for done in (1, 2, 3)]
     calls.clear()
-    words = [
-        "--model",
-        "dynamic-texture",
-        "--like",
-        clip,
-        "--frames",
-        "2",
-        "--dynamic-texture.centroid.iterations",
-        "1",
-    ]
+    words = ["--model", "dynamic-texture", "--like", clip, "--frames", "2"]
+    words += ["--dynamic-texture.centroid.iterations", "1"]
     assert run("centroid", tmp_path / "b.npy", *words)[0] == 0
     assert calls == [("centroid", k, 14) for k in range(1, 15)] + [("synthesize", k, 2) for k in (1, 2)]
     assert {stage for stage, *_ in calls} <= set(TITLES)
@@ -232,12 +215,8 @@ def pixel(folder):
         ("chart", ["--aperture", "0"], 2, "aperture"),
         ("chart", ["--exposure", "0.05"], 2, "exposure: expected 0 to the frame time"),
         ("chart", ["--strength", "weak", "--r0", "0.05"], 2, "--strength: contradicts r0"),
-        ("chart", ["--strength", "gale"], 2, "gale"),
         ("chart", ["--wind", "1", "--wind", "2"], 2, "wind: expected one value"),
-        ("chart", ["--frames", "0"], 2, "--frames"),
         ("chart", ["--frames", "1000000000"], 2, "--frames"),
-        ("chart", ["--seed", "-1"], 2, "--seed"),
-        ("chart", ["--size", "64"], 2, "--size"),
         ("chart", ["--size", "8x8"], 2, "at least 64"),
         ("chart", ["--size", "99999x99999"], 2, "--size: expected at most"),
         ("chart", ["--dynamic-texture.fit", "stretch"], 2, "--dynamic-texture: has no effect"),

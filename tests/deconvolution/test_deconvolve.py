@@ -193,24 +193,6 @@ def test_the_same_bytes_whatever_the_number_of_threads(monkeypatch, method):
     assert len({image.tobytes() for image in images}) == 1
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"method": "magic"},
-        {"boundary": "mirror"},
-        {"channels": "red"},
-        {"sigma": -1.0},
-        {"fidelity": 0.0},
-        {"fidelity": np.inf},
-        {"iterations": 0},
-        {"tolerance": -1.0},
-    ],
-)
-def test_impossible_settings_are_refused(settings):
-    with pytest.raises(ConfigurationError, match=f"{next(iter(settings))}: expected"):
-        DeconvolutionParams(**settings)
-
-
 def test_unusable_inputs_are_refused():
     image = np.zeros((8, 8), np.float32)
     with pytest.raises(ConfigurationError, match="sigma_or_psf"):

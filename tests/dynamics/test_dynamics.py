@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from flow_systems import flows_from, orthonormal, rotating_flows, rotation, run_system
 
-from turbrestore.core.errors import ConfigurationError, DataError
+from turbrestore.core.errors import DataError
 from turbrestore.dynamics import dynamic_texture as module
 from turbrestore.dynamics.dynamic_texture import DynamicsParams, identify, identify_memory, modes_memory
 from turbrestore.dynamics.flow_model import flow_of, predict_flow, project_deviation
@@ -209,22 +209,6 @@ def test_unusable_flows_are_a_clear_error(flows, words):
     with pytest.raises(DataError, match=words) as caught:
         identify(flows)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"rank": -1}, "rank"),
-        ({"energy": 0.0}, "energy"),
-        ({"energy": 1.1}, "energy"),
-        ({"max_rank": -1}, "max_rank"),
-        ({"frames_per_state": 0.5}, "frames_per_state"),
-        ({"ridge": -0.1}, "ridge"),
-    ],
-)
-def test_unusable_settings_are_a_clear_error(settings, words):
-    with pytest.raises(ConfigurationError, match=words):
-        DynamicsParams(**settings)
 
 
 def test_memory_follows_the_number_of_flows_and_states():

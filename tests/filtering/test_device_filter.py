@@ -6,7 +6,6 @@ from torch_devices import DEVICES, on_devices
 
 from conftest import SCENES, make_sequence
 from turbrestore.core.arrays import luminance
-from turbrestore.core.errors import ConfigurationError
 from turbrestore.dynamics.dynamic_texture import identify
 from turbrestore.filtering.alternating import filter_frames
 from turbrestore.filtering.filter_records import FilterParams
@@ -95,17 +94,6 @@ def test_frames_that_do_not_count_and_measured_flows(device):
     assert np.abs(here.image - there.image).mean() < 1e-3
     assert (np.isnan(here.sharpness) == np.isnan(there.sharpness)).all()
     assert np.isnan(here.sharpness).sum() == 2
-
-
-@on_devices
-def test_lack_of_memory_is_one_line(device, monkeypatch):
-    def fail(*_):
-        raise RuntimeError("CUDA out of memory.")
-
-    monkeypatch.setattr("turbrestore.filtering.frame_noise.warp_stack", fail)
-    frames, flows = frames_of(SCENES["camera"](48), 3)
-    with pytest.raises(ConfigurationError, match="^device: the memory of .* is not enough; process a smaller part"):
-        filter_both(frames, flows, flows, device)
 
 
 @pytest.mark.parametrize("device", ["cpu", *DEVICES])

@@ -40,15 +40,6 @@ def refused(result, folder, code=65):
     assert not list(folder.glob("*.result.*"))
 
 
-@pytest.mark.parametrize("suffix", hostile.FORMATS)
-def test_malformed_files_are_refused(run, tmp_path, suffix):
-    hostile.write_clip(tmp_path / f"whole{suffix}")
-    cases = hostile.malformed((tmp_path / f"whole{suffix}").read_bytes(), suffix)
-    for name in ("empty", "magic", "random", "cut010", "cut500", "cut995"):
-        (tmp_path / f"{name}{suffix}").write_bytes(cases[name])
-        refused(run("centroid", tmp_path / f"{name}{suffix}", tmp_path / "a.result.npz"), tmp_path)
-
-
 @pytest.mark.parametrize(("kind", "suffix"), hostile.FLIPPED.items())
 def test_a_flipped_byte_ends_in_one_line_or_in_frames(run, tmp_path, kind, suffix):
     hostile.write_clip(tmp_path / f"whole{suffix}", kind)

@@ -173,20 +173,6 @@ class TestInflation:
         with pytest.raises(DataError, match="damaged"):
             read_image(tmp_path / "a.tif")
 
-    @pytest.mark.parametrize("form", [(), (5, 7), (5, 7, 3), (5, 7, 4)])
-    @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-    def test_whole_pngs_are_read(self, tmp_path, form, dtype):
-        pixels = np.random.default_rng(0).integers(0, 255, form or (1, 1)).astype(dtype)
-        cv2.imwrite(str(tmp_path / "a.png"), pixels)
-        assert read_image(tmp_path / "a.png").image.shape[:2] == pixels.shape[:2]
-
-    @pytest.mark.parametrize("mode", ["1", "P", "L", "RGBA"])
-    def test_pngs_of_other_kinds_are_read(self, tmp_path, mode):
-        import PIL.Image
-
-        PIL.Image.fromarray(np.uint8(np.arange(63).reshape(7, 9))).convert(mode).save(tmp_path / "a.png")
-        assert read_image(tmp_path / "a.png").image.shape[:2] == (7, 9)
-
     @pytest.mark.parametrize("lost", [1, 40])
     def test_png_of_too_few_rows_is_refused_without_a_word_from_libpng(self, tmp_path, capfd, lost):
         hostile._png(tmp_path / "a.png", 32, extra=b"")

@@ -101,29 +101,6 @@ class TestArrays:
 
 
 class TestTiff:
-    @pytest.mark.parametrize(("axes", "shape"), [("TCYX", (14, 3)), ("ZCYX", (14, 3))])
-    @pytest.mark.parametrize("kind", ["imagej", "ome"])
-    def test_stacks_of_channels(self, tmp_path, axes, shape, kind):
-        frames = 257 * COLOUR.astype(np.uint16)
-        stack = np.moveaxis(frames, -1, 1).reshape(*shape, 40, 56)
-        name = "a.ome.tif" if kind == "ome" else "a.tif"
-        options = {"ome": True} if kind == "ome" else {"imagej": True}
-        tifffile.imwrite(
-            tmp_path / name, np.ascontiguousarray(stack), photometric="minisblack", metadata={"axes": axes}, **options
-        )
-        source = open_frames(tmp_path / name)
-        np.testing.assert_array_equal(source.read(), frames / np.float32(65535))
-
-    def test_other_numbers_of_channels_are_refused(self, tmp_path):
-        stack = np.ascontiguousarray(np.moveaxis(COLOUR[..., :2], -1, 1))
-        tifffile.imwrite(tmp_path / "a.tif", stack, imagej=True, metadata={"axes": "TCYX"})
-        refused(tmp_path / "a.tif", DataError, "3 channels, found T of 14, C of 2")
-
-    @pytest.mark.parametrize("axes", ["TYX", "ZYX", "CYX"])
-    def test_grey_stacks_stay_grey(self, tmp_path, axes):
-        tifffile.imwrite(tmp_path / "a.tif", STILL, imagej=True, metadata={"axes": axes})
-        assert open_frames(tmp_path / "a.tif").shape == STILL.shape
-
     @pytest.mark.parametrize("orientation", range(1, 9))
     def test_stacks_are_turned_upright(self, tmp_path, orientation):
         with tifffile.TiffWriter(tmp_path / "a.tif") as tiff:

@@ -60,10 +60,6 @@ def test_odd_rotations_are_remarked_on(tmp_path):
     assert remark.startswith("rotation of ") and remark.endswith(" ignored")
 
 
-def test_upright_videos_have_no_remark(tmp_path):
-    assert open_frames(encode(tmp_path / "a.mp4", scene(), "libx264", "yuv420p", "rgb24")).warnings == ()
-
-
 def test_pixels_that_are_not_square_are_remarked_on(tmp_path):
     path = encode(tmp_path / "a.mp4", scene(), "libx264", "yuv420p", "rgb24", x264_params="sar=16/11")
     (remark,) = open_frames(path).warnings

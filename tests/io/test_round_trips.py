@@ -95,6 +95,7 @@ def clip_file(suffix, depth, folder, pixels):
     write_video(path, frames, 25, depth, overwrite=True)
     found = open_frames(path)
     assert found.bit_depth == depth
+    assert found.fps in (None, pytest.approx(25)) and (found.fps is not None or suffix != ".mkv")
     same(np.asarray(found.read()), frames)
 
 
@@ -247,8 +248,8 @@ PAIRS = {
         for name, suffix, depths, least in (
             ("npy frames", ".npy", (8, 16), 1),
             ("TIFF stack", ".tif", (8, 16), 1),
-            ("SER", ".ser", (8, 12, 16), 1),
-            ("FFV1", ".mkv", (8, 16), 2),
+            ("SER", ".ser", (1, 8, 12, 16), 1),
+            ("FFV1", ".mkv", (8, 10, 12, 14, 16), 2),
         )
         for depth in depths
     },

@@ -104,11 +104,6 @@ class TestFormats:
         assert source.shape == (5, 48, 64, 3) and source.warnings == () and source.format == "gif/bgra"
         np.testing.assert_array_equal(source.read(), np.stack(frames) / np.float32(255))
 
-    def test_grey_avi_of_an_intra_codec(self, tmp_path):
-        frames = np.stack([frame[..., 0] for frame in scene()])
-        source = open_frames(grey_ffv1(tmp_path / "a.avi", frames))
-        np.testing.assert_array_equal(source.read(), frames / np.float32(255))
-
     def test_variable_frame_rate_is_told(self, tmp_path):
         stamps = [0, 1, 2, 5, 6, 20]
         frames = [frame[..., 0] for frame in scene(6)]

@@ -165,9 +165,6 @@ def test_bad_input_is_refused(sequence):
         find_centroid(sequence.frames[:1])
     with pytest.raises(ConfigurationError, match=r"^start: expected a frame below 16"):
         find_centroid(sequence.frames, CentroidParams(mode="single", start=16))
-    for bad in ({"mode": "median"}, {"iterations": 0}, {"tolerance": -1.0}, {"start": -1}):
-        with pytest.raises(ConfigurationError, match=f"^{next(iter(bad))}: expected"):
-            CentroidParams(**bad)
 
 
 @pytest.mark.parametrize(("mode", "iterations", "drafts"), [("fused", 3, 1), ("fused", 1, 0), ("single", 2, 0)])

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from turbrestore.core.errors import ConfigurationError
-from turbrestore.registration.centroid import CentroidParams, find_centroid
+from turbrestore.registration.centroid import find_centroid
 from turbrestore.registration.flow import FlowParams, estimate_flow
 from turbrestore.registration.flow_methods.tvl1 import prepare_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
@@ -83,21 +82,3 @@ def test_a_centroid_is_that_of_the_cpu_and_repeats_to_the_byte(device):
     assert np.abs(here.image - there.image).mean() < 1e-4
     assert np.linalg.norm(here.flows - there.flows, axis=-1).mean() < 0.02
     assert there.image.tobytes() == again.image.tobytes()
-
-
-@pytest.mark.parametrize(
-    ("place", "advice", "params"),
-    [
-        ("flow_methods.tvl1.tvl1_flows", "lower flow.tvl1.batch", TVL1),
-        ("warp.warp_stack", "process a smaller part .*", FlowParams()),
-    ],
-)
-def test_lack_of_memory_says_what_to_do(device, place, advice, params, monkeypatch):
-    def fail(*_, **__):
-        raise RuntimeError("CUDA out of memory.")
-
-    frames, _ = frames_of(SCENES["camera"](48, 48), 3, seed=17)
-    monkeypatch.setattr(f"turbrestore.registration.{place}", fail)
-    line = f"^device: the memory of '{device[:3]}.* is not enough; {advice} or use 'cpu'$"
-    with pytest.raises(ConfigurationError, match=line):
-        find_centroid(frames, CentroidParams(iterations=1), params, Runtime(device=device))

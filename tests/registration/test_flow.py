@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from turbrestore.core.errors import ConfigurationError, DataError
+from turbrestore.core.errors import DataError
 from turbrestore.metrics import endpoint_error
 from turbrestore.registration.flow import (
     FLOW_METHODS,
@@ -17,7 +17,7 @@ from turbrestore.registration.flow import (
     normalise_to_8_bits,
     prepare_reference,
 )
-from turbrestore.registration.flow_methods.opencv_flow import DisParams, FarnebackParams, dis_solver, flow_memory
+from turbrestore.registration.flow_methods.opencv_flow import DisParams, dis_solver, flow_memory
 from turbrestore.registration.flow_methods.refinement_step import flow_refinement
 from turbrestore.registration.flow_methods.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
 from turbrestore.registration.warp import warp
@@ -315,22 +315,6 @@ def test_images_too_small_for_flow_are_refused(size):
 def test_frames_of_another_size_are_refused():
     with pytest.raises(DataError, match="expected .96, 96. pixels, found .64, 64."):
         estimate_flow(texture(size=96), texture(size=64)[None])
-
-
-@pytest.mark.parametrize(
-    ("make", "name"),
-    [
-        (lambda: FlowParams(method="sift"), "method"),
-        (lambda: FlowParams(contrast_window=-1), "contrast_window"),
-        (lambda: FlowParams(contrast_floor=0), "contrast_floor"),
-        (lambda: DisParams(patch_stride=9), "patch_stride"),
-        (lambda: DisParams(finest_scale=9), "finest_scale"),
-        (lambda: FarnebackParams(neighbourhood=6), "neighbourhood"),
-    ],
-)
-def test_bad_settings_name_themselves(make, name):
-    with pytest.raises(ConfigurationError, match=f"^{name}: expected"):
-        make()
 
 
 def test_memory_of_flow_grows_with_pixels_channels_and_threads():

@@ -397,22 +397,3 @@ def test_small_images(size):
 def test_shapes_that_do_not_agree(act, message):
     with pytest.raises(DataError, match=f"^{message}"):
         act()
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("attachment", 0),
-        ("huber", -1),
-        ("warps", 0),
-        ("sweeps", 0),
-        ("step", 0),
-        ("median", 2),
-        ("levels", 0),
-        ("tolerance", float("nan")),
-        ("batch", 0),
-    ],
-)
-def test_bad_settings_name_themselves(name, value):
-    with pytest.raises(ConfigurationError, match=f"^{name}: expected"):
-        TvL1Params(**{name: value})

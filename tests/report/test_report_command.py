@@ -29,14 +29,8 @@ def clip(tmp_path_factory, frames):
 
 class TestCommand:
     def test_restore_and_report_write_the_same(self, clip, tmp_path, capsys):
-        words = [
-            "restore",
-            str(clip),
-            str(tmp_path / "o.png"),
-            "--until=centroid",
-            "--centroid.iterations=1",
-            "--quiet",
-        ]
+        words = ["restore", *map(str, (clip, tmp_path / "o.png")), "--until=centroid", "--centroid.iterations=1"]
+        words.append("--quiet")
         files = {name: tmp_path / name for name in ("r.html", "kept", "again.html")}
         assert main([*words, "--report", str(files["r.html"]), "--keep", str(files["kept"])]) == 0
         assert main(["report", str(files["kept"]), str(files["again.html"]), "--quiet"]) == 0

@@ -141,8 +141,6 @@ def test_a_pipe_in_the_folder_holds_nobody_up(ended, capsys, name):
 READING = {"sigma": 1.0, "ringing": 0.0, "overshoot": 0.1, "noise_gain": 1.0, "passed": True}
 DAMAGE = {
     "empty": lambda record: {},
-    "no record": lambda record: [1],
-    "schema is a flag": lambda record: record | {"schema": True},
     "outputs are numbers": lambda record: record | {"outputs": [1]},
     "files are numbers": lambda record: record | {"files": {"centroid.npz": 1}},
     "facts are lists": lambda record: record | {"facts": {"centroid": []}},

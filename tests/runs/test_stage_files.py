@@ -35,18 +35,6 @@ def restoration():
     return restore(frames, RestoreParams(centroid=CentroidParams(iterations=1)))
 
 
-@pytest.mark.parametrize("stage", ["centroid", "dynamics", "filtered", "deconvolution"])
-def test_a_result_comes_back_as_it_was(restoration, stage, tmp_path):
-    result = getattr(restoration, stage)
-    path = tmp_path / f"{stage}.npz"
-    save_artifact(path, result)
-    again = load_artifact(path, type(result))
-    for item in dataclasses.fields(result):
-        before, after = getattr(result, item.name), getattr(again, item.name)
-        assert type(before) is type(after), item.name
-        assert np.array_equal(before, after), item.name
-
-
 def test_an_image_is_read_from_artifacts_and_files(restoration, tmp_path):
     save_artifact(tmp_path / "a.npz", restoration.centroid)
     assert (load_stage_image(tmp_path / "a.npz") == restoration.centroid.image).all()

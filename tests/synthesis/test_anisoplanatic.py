@@ -400,27 +400,6 @@ def test_bad_scenes_are_refused_in_one_line(scene, part):
         assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"frame_rate": 0.0},
-        {"exposure": 0.05},
-        {"exposure": -0.01},
-        {"exposure": float("nan")},
-        {"sub_frames": 0},
-        {"photons": 0.0},
-        {"photons": float("nan")},
-        {"photons": 1e30},
-        {"read_noise": -0.1},
-        {"bit_depth": 17},
-    ],
-)
-def test_bad_cameras_are_refused_in_one_line(bad):
-    with pytest.raises(ConfigurationError, match=f"^{next(iter(bad))}: expected") as caught:
-        CameraParams(**bad)
-    assert "\n" not in str(caught.value)
-
-
 def test_frames_are_counted(chart):
     with pytest.raises(ConfigurationError, match="^count"):
         frames_of(chart, 0)

@@ -165,9 +165,6 @@ def test_the_mean_flow_is_left_out(training):
 
 def test_bad_parameters_are_refused(clip, training):
     rng = np.random.default_rng(0)
-    for bad in ({"residual": "half"}, {"fit": "fill"}, {"largest_modulus": 1.0}, {"largest_modulus": float("nan")}):
-        with pytest.raises(ConfigurationError, match=f"^{next(iter(bad))}: expected"):
-            DynamicTextureParams(**bad)
     for count in (0, -3):
         with pytest.raises(ConfigurationError, match="^count: expected"):
             synthesize_like(clip, count, rng)

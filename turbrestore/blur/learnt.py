@@ -42,8 +42,9 @@ _PICKED = np.array([1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20, 24, 28])
 _COSTS: Float64Array = np.geomspace(0.3, 9, 14)
 # Costs of a gradient above this are all the same, and so many gradients make a unit.
 _DEAREST, _GRADIENTS = 20.0, 40.0
-# Decibels below which no difference is seen, as in the tables of the benchmarks; and factors that are tried.
-_SEEN, _TRIED = 0.2, 200
+# Decibels below which no difference is seen, as in the tables of the benchmarks; decibels by which the gain of a wider
+# blur may be smaller; and number of factors that are tried.
+_SEEN, _ALIKE, _TRIED = 0.2, 0.1, 200
 # Least and largest logarithm of the deviation that a network is trained to say.
 LOG_SPREADS = (-3.0, 1.0)
 # Standardised values beyond this were hardly seen in training.
@@ -133,7 +134,7 @@ def learnt_blur(
     quantiles = width * np.exp(out[:, 0].mean() + spread * np.array([-1.0, 0.0, 1.0]))
     gains = out[:, 3:].mean(axis=0).reshape(len(EXPONENTS), -1)
     gains = gains - gains[:, :1]
-    exponents, likeliest = EXPONENTS, float(np.clip(out[:, 2].mean(), 1, 2))
+    exponents, likeliest = tuple[float, ...](EXPONENTS), float(np.clip(out[:, 2].mean(), 1, 2))
     if exponent is not None:
         share = np.clip((exponent - EXPONENTS[0]) / (EXPONENTS[1] - EXPONENTS[0]), 0, 1)
         gains, exponents, likeliest = np.array([1 - share, share])[None] @ gains, (exponent,), exponent
@@ -149,7 +150,7 @@ def _widest(gains: Float64Array, most: float) -> float:
     tried = np.linspace(FACTORS[1], FACTORS[-1], _TRIED)
     found = np.interp(tried, FACTORS, gains)
     most = max(most, float(tried[found.argmax()]))
-    return float(tried[(found >= found.max() - _SEEN) & (tried <= most)].max())
+    return float(tried[(found >= found.max() - _ALIKE) & (tried <= most)].max())
 
 
 def _spectrum(image: FloatArray) -> Float64Array:
