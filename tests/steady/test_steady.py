@@ -11,11 +11,13 @@ import skimage.data
 
 from turbrestore.blur.posterior import BlurWitnesses
 from turbrestore.core.errors import DataError
+from turbrestore.core.noise_spectrum import white_noise
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.steady.dewarping import measure_flow
 from turbrestore.steady.memory import Memory, remember
 from turbrestore.steady.settings import SteadyParams
-from turbrestore.steady.video import _find_blur, _Scenes, steady_frames
+from turbrestore.steady.video import WindowWitnesses, _find_blur, _find_witnesses, _Scenes, steady_frames
+from turbrestore.steady.windows import iter_windows
 from turbrestore.synthesis.anisoplanatic import phase_screen_frames
 from turbrestore.synthesis.atmosphere import PhaseScreenParams
 from turbrestore.synthesis.scenes import resolution_chart
@@ -168,7 +170,7 @@ class TestMemory:
 
 def test_width_of_what_is_remembered_gradually_becomes_that_of_its_own_image():
     soft, short = cv2.GaussianBlur(photo(), (0, 0), 2.0), np.ones((SIZE, SIZE), np.float32)
-    said, runtime = BlurWitnesses(0.5, 24.0), Runtime(threads=1)
+    said, runtime = WindowWitnesses(BlurWitnesses(0.5, 11.0), 0.5), Runtime(threads=1)
     scenes = _Scenes(SteadyParams(), 0.8, said, runtime)
 
     def width(scenes, image, held):
@@ -177,11 +179,44 @@ def test_width_of_what_is_remembered_gradually_becomes_that_of_its_own_image():
     assert width(scenes, soft, 1) == 0.8
     widths = [width(scenes, soft, 30) for _ in range(80)]
     assert 0 < max(np.diff([0.8, *widths])) < 0.1
-    assert widths[-1] == pytest.approx(_find_blur(soft, said, runtime)[0], abs=0.02)
+    assert widths[-1] == pytest.approx(_find_blur(soft, said, 30, runtime)[0], abs=0.02)
     given = _Scenes(SteadyParams(sigma=0.8), 0.8, None, runtime)
     assert width(given, soft, 30) == 0.8
     flat = _Scenes(SteadyParams(), 0.8, said, runtime)
     assert width(flat, 0 * soft, 30) == 0.8
+
+
+def test_noise_of_what_is_remembered_is_that_of_a_mean_of_the_frames_it_holds(monkeypatch):
+    said, noises, frames = WindowWitnesses(BlurWitnesses(0.5, 11.0, frame_noise=white_noise(0.04)), 0.5), [], []
+
+    def estimate(image, witnesses, noise, runtime):
+        noises.append(noise.deviation)
+        frames.append(witnesses.independent_frames)
+        return None, None
+
+    monkeypatch.setattr("turbrestore.steady.video.estimate_posterior", estimate)
+    scenes, held = _Scenes(SteadyParams(), 0.8, said, Runtime(threads=1)), np.full((SIZE, SIZE), 36, np.float32)
+    scenes._remembered_width(Memory(photo(), held, 36, STILL, photo(), np.zeros((SIZE, SIZE, 2)), 0.0))
+    assert noises == [pytest.approx(0.04 / 6)]
+    assert frames == [36]
+
+
+@pytest.mark.parametrize("case", ["object", "zoom", "both"])
+def test_neither_objects_nor_the_camera_add_to_the_displacement_by_the_air(case):
+    scene = photo(size=2 * SIZE)
+
+    def usual(zoom, moving):
+        truth = []
+        for number in range(13):
+            a = 1.0 + zoom * number
+            image = cv2.warpAffine(scene, np.array([[a, 0, 64 * (1 - 2 * a)], [0, a, 64 * (1 - 2 * a)]]), (SIZE, SIZE))
+            if moving:
+                image[50:78, 4 * number : 4 * number + 28] = photo("brick", 28)
+            truth.append(image)
+        window = list(iter_windows(shaken(truth, rms=0.6), (1, 3, 6)))[6]
+        return _find_witnesses(window, truth[6]).usual
+
+    assert usual(0.004 * (case != "object"), case != "zoom") == pytest.approx(usual(0, False), rel=0.5)
 
 
 @pytest.fixture(scope="module")

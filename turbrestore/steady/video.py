@@ -21,7 +21,7 @@ from itertools import chain, islice
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..blur.posterior import BlurWitnesses, estimate_posterior, measure_witnesses
+from ..blur.posterior import BlurWitnesses, blur_posterior, estimate_posterior, measure_witnesses
 from ..blur.psf import KOLMOGOROV
 from ..core.arrays import FloatArray, luminance
 from ..core.noise import estimate_noise
@@ -32,7 +32,7 @@ from ..io.source import FrameSource
 from ..registration.warp import sample_linear, warp
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import map_in_turns, one_thread_each
-from .camera_path.camera import Matrix, camera_flow
+from .camera_path.camera import Matrix, camera_flow, fit_camera
 from .camera_path.path import LONGEST, camera_position, homogeneous, longer_path, motion, smooth_motion
 from .deblurring import deblur
 from .dewarping import DewarpedFrame, dewarp_frame, measure_flow
@@ -43,9 +43,8 @@ from .memory import Memory, remember, shown
 from .settings import SteadyParams
 from .windows import Window, iter_windows, relit
 
-# Share of the width that is removed: too wide a blur costs more than too narrow a one, and compression, which makes
-# frames vary, makes the width too large.  Simulated clips without compression lose 0.1 dB by it.
-_CAUTION = 0.9
+# Median of the squared distance from the centre of a normal distribution in the plane, over the variance along an axis.
+_MEDIAN_SQUARE = 2 * np.log(2)
 # Frames that the memory holds on average when the width of its blur is estimated, and frames over which the width that
 # is removed goes there, so that no frame is suddenly sharper.
 _REMEMBERED, _GRADUALLY = 24, 16
@@ -122,11 +121,11 @@ def steady_frames(
         return
     # The first frame that has neighbours on both sides.
     head = list(islice(windows, params.reach // 2 + 1))
-    sigma, exponent, witnesses = params.sigma, KOLMOGOROV, None
+    sigma, exponent, said = params.sigma, KOLMOGOROV, None
     if head and sigma is None:
-        sigma, exponent, witnesses = _find_first(head[-1], params, runtime)
+        sigma, exponent, said = _find_first(head[-1], params, runtime)
     width = sigma or 0.0
-    scenes = _Scenes(params, width, witnesses, runtime)
+    scenes = _Scenes(params, width, said, runtime)
     if head:
         scenes.keep_title(head[-1])
     yield from map_in_turns(
@@ -147,60 +146,78 @@ def _one_by_one(windows: Iterable[Window], params: SteadyParams, runtime: Runtim
             if window.number == params.reach // 2:
                 scenes.keep_title(window)
                 if params.sigma is None:
-                    sigma, exponent, witnesses = _find_first(window, params, runtime)
-                    scenes.remove(sigma, witnesses)
+                    sigma, exponent, said = _find_first(window, params, runtime)
+                    scenes.remove(sigma, said)
             frame = dewarp_frame(window, params)
             yield _sharpened(frame, scenes.estimate(frame), sigma, exponent)
 
 
-def _find_first(window: Window, params: SteadyParams, runtime: Runtime) -> tuple[float, float, BlurWitnesses]:
+@dataclass(frozen=True, eq=False)
+class WindowWitnesses:
+    """What the frames of a window say about their blur."""
+
+    of_image: BlurWitnesses  # about that of an image fused from them
+    usual: float  # median of the displacement by the air, as a variance along an axis, squared pixels
+
+
+def _find_first(window: Window, params: SteadyParams, runtime: Runtime) -> tuple[float, float, WindowWitnesses]:
     """Width and exponent of the blur of all frames, from one with neighbours on both sides, and what witnesses say."""
     image = dewarp_frame(window, params).image
-    witnesses = _find_witnesses(window, image)
-    return *_find_blur(image, witnesses, runtime), witnesses
+    said = _find_witnesses(window, image)
+    return *_find_blur(image, said, said.of_image.independent_frames, runtime), said
 
 
-def _find_witnesses(window: Window, image: FloatArray) -> BlurWitnesses:
+def _find_witnesses(window: Window, image: FloatArray) -> WindowWitnesses:
     """Measure what the frames of a window, registered to the image fused from them, say about their blur."""
     frames = np.stack([window.frame.image, *(frame.image for frame in window.neighbours.values())])
-    still = np.zeros((*grid_of(image.shape), 2), np.float32)
-    flows = np.stack([enlarged(measure_flow(image, frame, still), image.shape) for frame in frames])
+    still, count = np.zeros((*grid_of(image.shape), 2), np.float32), float(len(frames))
+    coarse = [measure_flow(image, frame, still) for frame in frames]
+    flows = np.stack([enlarged(flow, image.shape) for flow in coarse])
     displacement = float(np.square(flows - np.median(flows, axis=(1, 2), keepdims=True)).mean())
-    return measure_witnesses(frames, flows, image, BlurWitnesses(displacement, float(len(frames))))
+    # The median leaves out objects, and flat parts, whose flow is arbitrary.
+    own = np.stack([flow - camera_flow(fit_camera(flow, image.shape), image.shape, flow.shape) for flow in coarse])
+    usual = float(np.median(np.square(own).sum(-1))) / _MEDIAN_SQUARE
+    return WindowWitnesses(measure_witnesses(frames, flows, image, BlurWitnesses(displacement, count)), usual)
 
 
-def _find_blur(image: FloatArray, witnesses: BlurWitnesses, runtime: Runtime) -> tuple[float, float]:
-    """Return width and exponent of the blur to remove: the smaller width of the posterior and of the image alone.
+def _find_blur(image: FloatArray, said: WindowWitnesses, count: float, runtime: Runtime) -> tuple[float, float]:
+    """Return width and exponent of the blur to remove from a mean of so many frames.
 
-    A window has few frames, and where they are registered badly they seem to vary; edges tell that nothing has blurred.
+    A window has few frames.  Where something moves or they are registered badly, they seem to vary, and the posterior
+    is too wide; where the scene is soft, so is what the image says.  Edges tell that nothing has blurred, and the
+    usual displacement how much the air can have blurred.  The least of the three widths is removed.
     """
-    grey = luminance(image)
+    grey, witnesses = luminance(image), said.of_image
     noise = white_noise(estimate_noise(grey))
     if witnesses.frame_noise is not None:
-        noise = witnesses.frame_noise.scaled(1 / witnesses.independent_frames)
+        noise = witnesses.frame_noise.scaled(1 / count)
+    variation = None if witnesses.variation is None else replace(witnesses.variation, frames=round(count))
+    witnesses = replace(witnesses, independent_frames=count, variation=variation)
     evidence, posterior = estimate_posterior(grey, witnesses, noise, runtime)
     if evidence is None:
         return 0.0, KOLMOGOROV
-    return _CAUTION * min(posterior.removed, evidence.estimate.removable), posterior.exponent
+    ratio = None if variation is None else variation.with_power(grey)
+    of_air = blur_posterior(evidence, replace(witnesses, displacement=said.usual), ratio).by_displacement[1]
+    return min(posterior.removed, evidence.estimate.removable, float(of_air)), posterior.exponent
 
 
 class _Scenes:
     """What is carried from frame to frame of a scene."""
 
-    def __init__(self, params: SteadyParams, sigma: float, witnesses: BlurWitnesses | None, runtime: Runtime) -> None:
+    def __init__(self, params: SteadyParams, sigma: float, said: WindowWitnesses | None, runtime: Runtime) -> None:
         self._params = params
         self._memory: Memory | None = None
         self._runtime = runtime
         self._found: float | None = None
         self._title: Title | None = None
-        self.remove(sigma, witnesses)
+        self.remove(sigma, said)
         self._positions: deque[Matrix] = deque(maxlen=LONGEST)
         # From the frame before to the steadied one.
         self._steadied = np.eye(3)
 
-    def remove(self, sigma: float, witnesses: BlurWitnesses | None) -> None:
+    def remove(self, sigma: float, said: WindowWitnesses | None) -> None:
         """Set the width of the blur of frames, and what is known of that of what is remembered if it may be another."""
-        self._witnesses, self._first, self._width = witnesses, sigma, sigma
+        self._said, self._first, self._width = said, sigma, sigma
 
     def keep_title(self, window: Window) -> None:
         """Keep the title that a static camera has drawn over the frames of a window, as long as it is there."""
@@ -255,9 +272,10 @@ class _Scenes:
 
     def _remembered_width(self, memory: Memory) -> float:
         """Width to remove from what is remembered, which gradually becomes the one that its own image needs."""
-        if self._witnesses is not None and self._found is None and memory.held.mean() >= _REMEMBERED:
+        count = float(memory.held.mean())
+        if self._said is not None and self._found is None and count >= _REMEMBERED:
             # An image that does not determine its width says nothing against the one that was found before.
-            self._found = max(_find_blur(memory.image, self._witnesses, self._runtime)[0], self._first)
+            self._found = max(_find_blur(memory.image, self._said, count, self._runtime)[0], self._first)
         if self._found is not None:
             self._width += (self._found - self._width) / _GRADUALLY
         return self._width
