@@ -50,7 +50,9 @@ BEYOND = 1.5
 # Place of the width of the posterior among the features.
 USUAL = 10
 # Networks, their inner width, epochs, size of a batch, rate, decay of the weights, and share of units that are dropped.
-NETWORKS, INNER, EPOCHS, BATCH, RATE, DECAY, DROPPED = 10, 48, 60, 64, 3e-3, 0.3, 0.3
+NETWORKS, INNER, EPOCHS, BATCH, RATE, DECAY, DROPPED = 10, 48, 14, 128, 3e-3, 0.3, 0.3
+# Copies of a clip relative to other widths; deviation of the logarithm of these about the right one and the usual one.
+COPIES, NEARBY, FAR = 5, 0.3, 0.5
 
 
 class _ReachedError(Exception):
@@ -194,22 +196,33 @@ def read_clips(folder: Path) -> TrainingClips:
 
 def train_networks(clips: TrainingClips, chosen: np.ndarray) -> dict[str, np.ndarray]:
     """Train networks on some clips, and return their weights and the scale of the features."""
-    low, middle, high = np.nanquantile(clips.features[chosen], (0.02, 0.5, 0.98), axis=0)
+    features, usual = clips.features[chosen], clips.usual[chosen]
+    low, middle, high = np.nanquantile(features, (0.02, 0.5, 0.98), axis=0)
     scale = np.maximum((high - low) / 4, 1e-3)
-    x = torch.tensor(
-        np.clip(np.nan_to_num((clips.features[chosen] - middle) / scale), -FARTHEST, FARTHEST), dtype=torch.float32
-    )
-    log_width = np.log(clips.width / clips.usual)[chosen, None]
-    grid = [_gains_at(clips.gains[place], clips.usual[place] * FACTORS).ravel() for place in np.flatnonzero(chosen)]
-    targets = [log_width, clips.exponent[chosen, None], np.array(grid) / UNIT]
-    y = torch.tensor(np.concatenate(targets, axis=1), dtype=torch.float32)
+    standard = np.clip(np.nan_to_num((features - middle) / scale), -FARTHEST, FARTHEST)
+    # The posterior may be wrong by a factor.  So that the networks learn gains at every width, and not only where it is
+    # right, each clip is shown relative to other widths as well; how much wider these are is one more input, which is 0
+    # when the networks are used.
+    rng, x, y = np.random.default_rng(0), [], []
+    right = np.log(clips.width[chosen] / usual)
+    for copy in range(COPIES):
+        wider = rng.standard_normal(len(usual)) * (NEARBY if copy % 2 else FAR) + (right if copy % 2 else 0)
+        wider *= copy > 0
+        grid = [
+            _gains_at(gains, width * FACTORS).ravel()
+            for gains, width in zip(clips.gains[chosen], usual * np.exp(wider), strict=True)
+        ]
+        x.append(np.column_stack([standard, np.clip(wider / FAR, -FARTHEST, FARTHEST)]))
+        y.append(np.column_stack([right - wider, clips.exponent[chosen], np.array(grid) / UNIT]))
+    inputs, targets = (torch.tensor(np.concatenate(part), dtype=torch.float32) for part in (x, y))
     layers: dict[str, list[np.ndarray]] = {f"{kind}{layer}": [] for layer in (1, 2, 3) for kind in "wb"}
     for member in range(NETWORKS):
-        network = _train_one(x, y, member)
+        network = _train_one(inputs, targets, member)
         for layer, place in ((1, 0), (2, 3), (3, 6)):
             layers[f"w{layer}"].append(network[place].weight.detach().numpy())
             layers[f"b{layer}"].append(network[place].bias.detach().numpy())
     weights = {"middle": middle, "scale": scale, **{name: np.array(values) for name, values in layers.items()}}
+    weights["w1"] = weights["w1"][..., :-1]
     for name in ("w3", "b3"):
         weights[name][:, 3:] *= UNIT
     return weights

@@ -35,15 +35,15 @@ from .witnesses.image_evidence import ImageEvidence
 from .witnesses.spectral_variation import RINGS, SIDE, SpectralVariation, window_power
 
 # Grid of G: widths relative to that of the posterior, the first of which is no blur, and exponents.
-FACTORS: Float64Array = np.array([0, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.35, 1.6, 2.0, 2.6])
+FACTORS: Float64Array = np.array([0, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.35, 1.6, 2.0, 2.6])
 EXPONENTS = (1.3, 2.0)
 # Rings whose values are read, and widths at which costs of the image are read, pixels.
 _PICKED = np.array([1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20, 24, 28])
 _COSTS: Float64Array = np.geomspace(0.3, 9, 14)
 # Costs of a gradient above this are all the same, and so many gradients make a unit.
 _DEAREST, _GRADIENTS = 20.0, 40.0
-# Decibels below which no difference is seen, as in the tables of the benchmarks; decibels by which the gain of a wider
-# blur may be smaller; and number of factors that are tried.
+# Decibels below which a gain is not seen, as in the tables of the benchmarks; by which a wider blur may gain less; and
+# number of factors that are tried.
 _SEEN, _ALIKE, _TRIED = 0.2, 0.1, 200
 # Least and largest logarithm of the deviation that a network is trained to say.
 LOG_SPREADS = (-3.0, 1.0)
