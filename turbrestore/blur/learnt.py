@@ -42,8 +42,9 @@ _PICKED = np.array([1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20, 24, 28])
 _COSTS: Float64Array = np.geomspace(0.3, 9, 14)
 # Costs of a gradient above this are all the same, and so many gradients make a unit.
 _DEAREST, _GRADIENTS = 20.0, 40.0
-# Decibels below which no difference is seen, as in the tables of the benchmarks; and number of factors that are tried.
-_SEEN, _TRIED = 0.2, 200
+# Decibels below which a gain is not seen, as in the tables of the benchmarks; by which a wider blur may gain less; and
+# number of factors that are tried.
+_SEEN, _ALIKE, _TRIED = 0.2, 0.1, 200
 # Least and largest logarithm of the deviation that a network is trained to say.
 LOG_SPREADS = (-3.0, 1.0)
 # Standardised values beyond this were hardly seen in training.
@@ -149,7 +150,7 @@ def _widest(gains: Float64Array, most: float) -> float:
     tried = np.linspace(FACTORS[1], FACTORS[-1], _TRIED)
     found = np.interp(tried, FACTORS, gains)
     most = max(most, float(tried[found.argmax()]))
-    return float(tried[(found >= found.max() - _SEEN) & (tried <= most)].max())
+    return float(tried[(found >= found.max() - _ALIKE) & (tried <= most)].max())
 
 
 def _spectrum(image: FloatArray) -> Float64Array:
