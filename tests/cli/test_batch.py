@@ -340,7 +340,7 @@ def start(words, workers):
         [sys.executable, "-m", "turbrestore_cli", *words, "--workers", str(workers)],
         stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
-    timer = threading.Timer(120, process.kill)
+    timer = threading.Timer(300, process.kill)
     timer.start()
     line = process.stderr.readline()
     assert line.startswith("turbrestore: 1 of "), line
