@@ -113,7 +113,7 @@ def _calibrated(source: FrameSource, selection: Selection) -> FrameSource:
     """Take out what ``--dark`` and ``--flat`` name."""
     if selection.dark is None and selection.flat is None:
         return source
-    from turbrestore.footage.calibration import calibrated, make_calibration
+    from turbrestore.footage.sensor.calibration import calibrated, make_calibration
 
     limits = selection.limits()
     dark, flat = (

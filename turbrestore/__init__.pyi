@@ -13,10 +13,10 @@ from .dynamics.simulate import simulate as simulate
 from .filtering.alternating import Filtered as Filtered
 from .filtering.alternating import FilterParams as FilterParams
 from .filtering.alternating import filter_frames as filter_frames
-from .footage.calibration import Calibration as Calibration
-from .footage.calibration import calibrate as calibrate
-from .footage.calibration import calibrated as calibrated
-from .footage.calibration import make_calibration as make_calibration
+from .footage.sensor.calibration import Calibration as Calibration
+from .footage.sensor.calibration import calibrate as calibrate
+from .footage.sensor.calibration import calibrated as calibrated
+from .footage.sensor.calibration import make_calibration as make_calibration
 from .footage.checks.content import ContentParams as ContentParams
 from .footage.checks.content import ContentReport as ContentReport
 from .footage.checks.content import check_content as check_content

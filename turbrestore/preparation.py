@@ -24,8 +24,8 @@ from .footage.lighting.light import find_light
 from .footage.lighting.range import find_range
 from .footage.lighting.white_balance import find_white_balance
 from .footage.overlays import find_overlay, read_static_mask
-from .footage.pixel_pattern import find_pixel_pattern
-from .footage.sensor_pattern import find_stripes
+from .footage.sensor.pixel_pattern import find_pixel_pattern
+from .footage.sensor.stripes import find_stripes
 from .footage.survey import Survey, take_survey
 from .io.source import FrameSource, Window
 from .results import Restoration, at_levels_of_clip

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from conftest import corrected, make_sequence, surveyed
-from turbrestore.footage.pixel_pattern import _white_part, find_pixel_pattern
+from turbrestore.footage.sensor.pixel_pattern import _white_part, find_pixel_pattern
 
 SIDE, COUNT = 128, 24
 

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from conftest import corrected, make_sequence, surveyed
-from turbrestore.footage.sensor_pattern import _dead, find_stripes
+from turbrestore.footage.sensor.stripes import _dead, find_stripes
 
 SIDE = 160
 

@@ -10,7 +10,7 @@ import pytest
 from astropy.io import fits
 
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.footage.calibration import calibrated, make_calibration
+from turbrestore.footage.sensor.calibration import calibrated, make_calibration
 from turbrestore.footage.checks.content import check_content, clean_source
 from turbrestore.io.astronomy.fits import open_fits
 from turbrestore.io.astronomy.fits_output import write_fits

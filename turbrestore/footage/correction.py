@@ -25,7 +25,9 @@ Apply = Callable[[int, FloatArray, Window], FloatArray]
 class PutBack(Protocol):
     """Puts what is no scene back into an image whose first pixel is at (left, top) of the frame."""
 
-    def __call__(self, image: FloatArray, left: int = 0, top: int = 0) -> FloatArray: ...  # noqa: D102
+    def __call__(self, image: FloatArray, left: int = 0, top: int = 0) -> FloatArray:
+        """Return an image (H, W[, 3]) with it."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,15 +20,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray, luminance
-from ..core.decision import Decision
-from ..core.gradient import sobel_gradient
-from ..core.thresholds import threshold
-from ..io.counts import NEIGHBOURS
-from ..io.source import Window
-from .correction import Correction
-from .placement import relative_window
-from .survey import FEWEST, Survey
+from ...core.arrays import FloatArray, luminance
+from ...core.decision import Decision
+from ...core.gradient import sobel_gradient
+from ...core.thresholds import threshold
+from ...io.counts import NEIGHBOURS
+from ...io.source import Window
+from ..correction import Correction
+from ..placement import relative_window
+from ..survey import FEWEST, Survey
 
 
 @dataclass(frozen=True)

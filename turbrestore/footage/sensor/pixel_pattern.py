@@ -25,16 +25,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import ROUNDING, FloatArray, luminance
-from ..core.decision import Decision
-from ..core.gradient import sobel_gradient
-from ..core.robust import robust_scale
-from ..core.thresholds import threshold
-from ..io.source import Window
-from .correction import Correction
-from .placement import relative_window
-from .sensor_pattern import LIMITS as STRIPES
-from .survey import FEWEST, Moments, Survey
+from ...core.arrays import ROUNDING, FloatArray, luminance
+from ...core.decision import Decision
+from ...core.gradient import sobel_gradient
+from ...core.robust import robust_scale
+from ...core.thresholds import threshold
+from ...io.source import Window
+from ..correction import Correction
+from ..placement import relative_window
+from .stripes import LIMITS as STRIPES
+from ..survey import FEWEST, Moments, Survey
 
 
 @dataclass(frozen=True)

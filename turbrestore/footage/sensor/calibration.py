@@ -15,14 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
-from ..core.errors import DataError
-from ..core.remarks import counted
-from ..core.robust import robust_scale
-from ..io.output import size_text
-from ..io.pixels import PixelArray, planes_of, to_unit, with_planes
-from ..io.source import FrameSource
-from .checks.missing_pixels import fill_holes
+from ...core.arrays import FloatArray
+from ...core.errors import DataError
+from ...core.remarks import counted
+from ...core.robust import robust_scale
+from ...io.output import size_text
+from ...io.pixels import PixelArray, planes_of, to_unit, with_planes
+from ...io.source import FrameSource
+from ..checks.missing_pixels import fill_holes
 
 # A pixel is hot where the dark exceeds its median by so many standard deviations, and by so much of full scale.
 _HOT_DEVIATIONS, _HOT_LEAST = 8.0, 0.01

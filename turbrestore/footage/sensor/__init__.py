@@ -1,0 +1,1 @@
+"""What the sensor adds to every frame: dark frames and flat fields, stripes, offsets of its pixels."""
