@@ -6,8 +6,8 @@ from astropy.io import fits
 
 from conftest import make_sequence
 from turbrestore.core.errors import DataError
-from turbrestore.footage.sensor.calibration import calibrated, make_calibration
 from turbrestore.footage.checks.content import check_content, clean_source
+from turbrestore.footage.sensor.calibration import calibrated, make_calibration
 from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video

@@ -10,8 +10,8 @@ import pytest
 from astropy.io import fits
 
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.footage.sensor.calibration import calibrated, make_calibration
 from turbrestore.footage.checks.content import check_content, clean_source
+from turbrestore.footage.sensor.calibration import calibrated, make_calibration
 from turbrestore.io.astronomy.fits import open_fits
 from turbrestore.io.astronomy.fits_output import write_fits
 from turbrestore.io.images.image_files import read_image, write_image

@@ -33,8 +33,8 @@ from ...core.thresholds import threshold
 from ...io.source import Window
 from ..correction import Correction
 from ..placement import relative_window
-from .stripes import LIMITS as STRIPES
 from ..survey import FEWEST, Moments, Survey
+from .stripes import LIMITS as STRIPES
 
 
 @dataclass(frozen=True)
