@@ -116,7 +116,8 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
     def video(key: str, name: str) -> Response:
         tab = _find(tabs, key)
         film = None if tab is None else tab.films.get(name)
-        if film is None:
+        # The system may have emptied its folder of temporary files.
+        if film is None or not film.is_file():
             return Response(status_code=404 if tab is None else 204)
         return FileResponse(film, media_type="video/mp4", headers={"Cache-Control": "no-store"})
 
