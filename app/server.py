@@ -103,13 +103,12 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
     async def page() -> None:
         await _show(shown, tabs, folders, file)
 
-    # A busy browser may ask late for what newer images have replaced; that is no error, so its answer is an empty one.
     @app.get("/pictures/{key}/{name}", response_class=Response)
     def picture(key: str, name: str) -> Response:
         tab = _find(tabs, key)
         data = None if tab is None else tab.pictures.get(name)
         if data is None:
-            return Response(status_code=404 if tab is None else 204)
+            return _nothing_for(tab)
         return Response(data, media_type="image/png", headers={"Cache-Control": "no-store"})
 
     @app.get("/videos/{key}/{name}", response_class=Response)
@@ -118,7 +117,7 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
         film = None if tab is None else tab.films.get(name)
         # The system may have emptied its folder of temporary files.
         if film is None or not film.is_file():
-            return Response(status_code=404 if tab is None else 204)
+            return _nothing_for(tab)
         return FileResponse(film, media_type="video/mp4", headers={"Cache-Control": "no-store"})
 
     def stop_all() -> None:
@@ -141,6 +140,16 @@ def _build(token: str, port: int, folders: Folders, file: Path | None, tabs: set
     guard = Guard(web, token, port, DEFAULT_LIMITS.max_bytes + 4096)
     config = uvicorn.Config(guard, log_level="critical", access_log=False, timeout_graceful_shutdown=_FAREWELL)
     return uvicorn.Server(config)
+
+
+def _nothing_for(tab: Tab | None) -> Response:
+    """Answer a request for what does not exist, which is an error for strangers only.
+
+    A busy browser may ask late for what newer images have replaced; that is no error, so its answer is an empty one.
+    """
+    from fastapi import Response
+
+    return Response(status_code=404 if tab is None else 204)
 
 
 def _find(tabs: set[Tab], key: str) -> Tab | None:
