@@ -164,3 +164,12 @@ def test_where_no_noise_is_certain_it_is_taken_for_white(model_and_frames):
     # What is certain counts: noise without high frequencies has more power at the low ones, where the template is.
     smooth_noise = NoiseSpectrum(1e-4 * np.exp(-((8 * RINGS) ** 2)), np.zeros(RINGS.size), np.zeros(RINGS.size))
     assert np.square(_coloured(template, smooth_noise)).mean() > 1.5 * np.square(template).mean()
+
+
+def test_flat_ground_without_noise_has_finite_statistics():
+    y, x = np.mgrid[:64, :64] - 31.5
+    scene = np.exp(-(x**2 + y**2) / 10).astype(np.float32)
+    frames = [scene * np.float32(1 + 0.1 * n) for n in range(6)]
+    with np.errstate(all="raise", under="ignore"):
+        found = measure_frame_statistics(frames, [np.zeros((64, 64, 2), np.float32)] * 6, scene)
+    assert np.isfinite(found.score_scale).all() and np.isfinite(found.score_variance).all()

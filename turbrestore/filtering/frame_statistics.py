@@ -104,6 +104,7 @@ def measure_frame_statistics(
     noise = noise_of_frames(frames, flows, mean_frame)
     coloured = _coloured(template, noise)
     sharpness, spread, explained, left_out = _leave_middle_out(moments, coloured, sensor_noise, window)
+    # Where a scene without noise is flat, the square of the scale exceeds single precision.
     scale = _score_scale(sharpness, spread, explained)
     weight = _sharpness_weight(sharpness, spread - explained, scale**2 * spread, float(sensor_noise.mean()) / count)
     # Near a moving object the flow follows it, and a frame may be sharp without showing the scene.
@@ -114,7 +115,7 @@ def measure_frame_statistics(
         template=template,
         template_energy=float(square.sum(dtype=np.float64)),
         mean_sharpness=sharpness.astype(np.float32),
-        score_scale=scale,
+        score_scale=scale.astype(np.float32),
         score_variance=(scale**2 * spread).astype(np.float32),
         window=window,
         left_out=left_out,
@@ -278,14 +279,14 @@ def _leave_middle_out(
     return sharpness, np.maximum(spread, 0.0), explained / rest, kappa
 
 
-def _score_scale(sharpness: np.ndarray, spread: np.ndarray, explained: np.ndarray) -> FloatArray:
+def _score_scale(sharpness: np.ndarray, spread: np.ndarray, explained: np.ndarray) -> np.ndarray:
     """Factor from a deviation of the sharpness to the best estimate of its standardised noise-free part.
 
     Noise explains a part of the variance ``spread``; the rest is sharpness.
     """
     deviation = np.sqrt(np.maximum(spread - explained, 0.0))
     whole = spread + (_LEAST_SPREAD * sharpness) ** 2
-    return np.divide(deviation, whole, out=np.zeros_like(whole), where=whole > 0).astype(np.float32)
+    return np.divide(deviation, whole, out=np.zeros_like(whole), where=whole > 0)
 
 
 def _sharpness_weight(sharpness: np.ndarray, spread: np.ndarray, score_variance: np.ndarray, noise: float) -> float:
