@@ -1,9 +1,9 @@
 """Training of the estimator of the blur on simulated clips.
 
-``python benchmarks/blur_training.py make FOLDER FIRST LAST [--large]`` restores the clips of the seeds FIRST to LAST − 1
-(:mod:`blur_simulators`) up to the point where their blur is looked for, and keeps for each what the estimator then
-knows, the true transfer function, and the error of the image behind every blur that might be removed.  Clips that are
-there are kept, so it goes on where it stopped.
+``python benchmarks/blur_training.py make FOLDER FIRST LAST [--large]`` restores the clips of the seeds from FIRST to
+before LAST (:mod:`blur_simulators`) up to the point where their blur is looked for, and keeps for each what the
+estimator then knows, the true transfer function, and the error of the image behind every blur that might be removed.
+Clips that are there are kept, so it goes on where it stopped.
 
 ``python benchmarks/blur_training.py train FOLDER [--write benchmarks/results/blur_training.md]`` trains the networks of
 :mod:`turbrestore.blur.learnt` and writes their weights.  The table is of networks that were trained without the
