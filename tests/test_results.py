@@ -38,8 +38,8 @@ def test_the_motion_of_the_verdict_is_that_of_the_flows(restoration):
 
 
 def widths(restoration, low, width, high):
-    """The posterior with other quantiles of the width."""
-    return replace(restoration.posterior, width=np.array([low, width, high]))
+    """The posterior with other quantiles of the width, the median of which is to be removed."""
+    return replace(restoration.posterior, width=np.array([low, width, high]), removed=width)
 
 
 def test_every_doubt_is_named_once_with_a_remedy(restoration):
@@ -62,7 +62,6 @@ def test_every_doubt_is_named_once_with_a_remedy(restoration):
         CheckKind.UNSEEN: {"unseen": 0.04},
         CheckKind.NO_BLUR_REMOVED: {"deconvolution": none, "posterior": widths(restoration, 0.6, 0.9, 1.2)},
         CheckKind.BLUR_LEFT: {"posterior": widths(restoration, 1.5 * removed, 2.5 * removed, 3 * removed)},
-        CheckKind.BLUR_UNCERTAIN: {"posterior": widths(restoration, 0.4 * removed, removed, 1.2 * removed)},
         CheckKind.BLUR_UNKNOWN: {"blur": replace(restoration.blur, uncertainty=math.inf)},
         CheckKind.TOO_SHARP: {"guard_readings": (replace(reading, passed=False),)},
     }  # fmt: skip
@@ -85,6 +84,12 @@ def test_a_remedy_names_the_width_that_was_measured(restoration):
     (check,) = changed.verdict.checks
     assert check.text == "no blur is removed, although 0.93 pixels were measured (0.61 to 1.20)"
     assert check.remedy.startswith("--sigma 0.93 ")
+
+
+def test_a_blur_whose_removal_would_not_be_seen_is_no_doubt(restoration):
+    posterior = replace(widths(restoration, 0.61, 0.93, 1.2), removed=0.0)
+    changed = replace(restoration, deconvolution=replace(restoration.deconvolution, sigma=0.0), posterior=posterior)
+    assert changed.verdict.checks == ()
 
 
 def test_a_shift_of_the_whole_frame_is_no_doubt_about_the_geometry(restoration):

@@ -38,14 +38,12 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-# Blur that pixels and interpolation have by themselves, and error of the geometry that is seen, pixels.
-_SEEN_BLUR, _SEEN_BEND = 0.5, 1.0
+# Error of the geometry that is seen, pixels.
+_SEEN_BEND = 1.0
 # Frames whose halves are too few to tell what they agree on.
 FEW = 8
 # Share of the image that is worth a look; most of something.
 _UNSEEN, _HALF = 0.01, 0.5
-# Factor by which a width may be off; ``benchmarks/verdicts.py`` lists what more costs.
-_OFF = 1.5
 # Largest displacement, in standard deviations along an axis.
 _LARGEST = 3.0
 
@@ -264,14 +262,11 @@ def _checks_of_blur(restoration: Restoration) -> Iterator[Check]:
     if restoration.blur is not None and not math.isfinite(restoration.blur.uncertainty):
         yield write_check(CheckKind.BLUR_UNKNOWN)
         return
-    low, width, high = map(float, restoration.posterior.width)
-    if width <= _SEEN_BLUR:
-        return
-    if removed < min(low, _HALF * width):
+    # Nothing is wrong where removing a blur would not be seen to help: such clips are bad no more often than others.
+    if removed < _HALF * restoration.posterior.removed:
         kind = CheckKind.BLUR_LEFT if removed > 0 else CheckKind.NO_BLUR_REMOVED
+        low, width, high = map(float, restoration.posterior.width)
         yield write_check(kind, width, low, high, removed)
-    elif high > _OFF**2 * low:
-        yield write_check(CheckKind.BLUR_UNCERTAIN, removed, low, high)
 
 
 def _share_of_air(flows: FloatArray) -> float:

@@ -75,10 +75,6 @@ _CHECKS = {
         "{3:.2f} pixels of blur are removed, although {0:.2f} were measured ({1:.2f} to {2:.2f})",
         "--sigma {0:.2f} removes all; ignore this if edges ring then",
     ),
-    CheckKind.BLUR_UNCERTAIN: (
-        "{0:.2f} pixels of blur are removed, but {1:.2f} to {2:.2f} are possible",
-        "--sigma {2:.2f} shows whether more is better",
-    ),
     CheckKind.BLUR_UNKNOWN: (
         "the width of the blur could not be measured, and none is removed",
         "--sigma 1 removes a usual one",

@@ -30,7 +30,6 @@ class CheckKind(StrEnum):
     UNSEEN = "unseen"
     NO_BLUR_REMOVED = "no blur removed"
     BLUR_LEFT = "blur left"
-    BLUR_UNCERTAIN = "blur uncertain"
     BLUR_UNKNOWN = "blur unknown"
     TOO_SHARP = "too sharp"
     DRIFT = "drift"  # of a steadied video
