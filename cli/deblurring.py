@@ -71,8 +71,8 @@ def deconvolve(
         Image (.png, .tif) or stage file (.npz) to write.  With --sweep a contact sheet, .png, by default sweep.png in
         the folder of the run.
     sigma : float
-        Width of the blur, pixels.  A Gaussian unless --deconvolution.exponent says otherwise; that of the run or estimated
-        by default.
+        Width of the blur, pixels.  A Gaussian unless --deconvolution.exponent says otherwise; by default that of the
+        run, else estimated.
     psf : Path
         Image of a star, or a measured point spread function, in pixels of the input.  It is removed instead of a blur
         of some width.
