@@ -230,7 +230,8 @@ def stage_costs(folder: Path) -> str:
             "centroid": seconds["centroid"] / train,
             "filter": sum(seconds.get(stage, 0) for stage in ("seeing", "identify", "filter")) / frames,
             "witnesses": seconds["witnesses"] / train,
-            "width and deconvolve": (seconds["deconvolve"] + seconds["uncertainty"]) / pixels,
+            "width": seconds["width"] / pixels,
+            "deconvolve": (seconds["deconvolve"] + seconds["uncertainty"]) / pixels,
         }
         lines.append(f"{preset}: {', '.join(f'{stage} {cost:.2f}' for stage, cost in costs.items())}")
     return "\n".join(lines)

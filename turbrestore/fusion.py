@@ -65,7 +65,7 @@ _RECORDED = (
 )
 
 # Stages that take a while and have no steps to count.
-_WITHOUT_STEPS = ("witnesses",)
+_WITHOUT_STEPS = ("witnesses", "width")
 
 Result = TypeVar("Result")
 

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .blind.remove_blur import SIGMAS_A_SIDE, Deblurred, remove_blur_steps
+from .blind.remove_blur import SIGMAS_A_SIDE, Deblurred, find_blur, remove_blur_steps
 from .blur.measured_psf import psf_from_image
 from .core.arrays import FloatArray
 from .core.decision import Decision
@@ -199,7 +199,7 @@ def _deblur_and_crop(run: Run, fused: Restoration, evidence: Evidence, psf: NDAr
     deblurred, agreed = None, None
     if params.runs("deconvolve") and evidence.finds_blur and not evidence.is_mean:
         photons = None if halves is None else measure_photon_noise(run, halves.alternate)
-        deblurred = run.stage("deconvolve", "deblurred", lambda: _remove_blur(run, fused, evidence, psf, photons))
+        deblurred = run.from_store("deblurred", lambda: _remove_blur(run, fused, evidence, psf, photons))
         run.decide(*deblurred.decisions)
         image = deblurred.deconvolution.image
         if halves is not None and deblurred.posterior is not None:
@@ -262,14 +262,15 @@ def _remove_blur(
     params, plan, guide = run.params, run.plan, fused.centroid.image
     if fused.filtered is not None:
         guide = recentre(guide, fused.filtered.mean_flow)
-    if run.progress is not None and evidence.witnesses is not None:
-        run.progress("width", 0, 1)
+    found = None
+    if evidence.witnesses is not None:
+        with run.timed("width"):
+            found = find_blur(fused.image, params.deconvolution, plan.runtime, evidence.witnesses, evidence.noise)
     settings = params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side
     full_scale = run.prepared.levels.full_scale
-    steps = remove_blur_steps(
-        fused.image, guide, *settings, evidence.witnesses, psf, photons, full_scale, evidence.noise
-    )
-    return finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
+    steps = remove_blur_steps(fused.image, guide, *settings, found, psf, photons, full_scale, evidence.noise)
+    with run.timed("deconvolve"):
+        return finish(steps, run.counter("deconvolve", params.deconvolution.iterations))
 
 
 def _measure_uncertainty(

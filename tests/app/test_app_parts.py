@@ -131,7 +131,7 @@ class TestJob:
     def test_it_says_what_it_does(self, restored, folder):
         job = ended(Job(lambda job: restore_order(Order(folder / "clip.mkv", params=QUICK), job)))
         assert job.state == "done"
-        assert list(job.bars) == ["centroid", "filter", "deconvolve"]
+        assert list(job.bars) == ["read", "centroid", "filter", "deconvolve"]
         assert all(bar.share == 1 for bar in job.bars.values())
         assert list(job.images) == ["frame", "centroid", "filtered", "mean", "deblurred"]
         assert tuple(job.decisions) == job.result.restoration.decisions
@@ -163,7 +163,7 @@ class TestOrders:
     def test_another_deconvolution_alone_takes_over_the_rest(self, restored):
         order = replace(restored.order, params=replace(QUICK, deconvolution=DeconvolutionParams(method="tv", sigma=2)))
         job = ended(Job(lambda job: restore_order(order, job, restored)))
-        assert list(job.bars) == ["deconvolve"]
+        assert list(job.bars) == ["read", "deconvolve"]
         again = job.result.restoration
         assert again.filtered is restored.restoration.filtered
         anew = ended(Job(lambda job: restore_order(order, job))).result.restoration

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from turbrestore.blind.decisions import explain_posterior
-from turbrestore.blind.remove_blur import remove_blur_steps
+from turbrestore.blind.remove_blur import find_blur, remove_blur_steps
 from turbrestore.blur.estimation import find_candidates
 from turbrestore.blur.posterior import EXCLUDED, BlurWitnesses, blur_posterior, estimate_posterior, measure_witnesses
 from turbrestore.blur.psf import half_frequency, radial_otf
@@ -16,6 +16,8 @@ from turbrestore.blur.witnesses.image_evidence import image_evidence, judged_can
 from turbrestore.blur.witnesses.short_exposure import displacement_variance, short_exposures
 from turbrestore.blur.witnesses.spectral_variation import RINGS, SpectralVariation
 from turbrestore.core.noise_spectrum import white_noise
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+from turbrestore.runtime.runtime import DEFAULT
 from turbrestore.runtime.steps import finish
 from turbrestore.synthesis.scenes import SCENES
 
@@ -102,7 +104,8 @@ def test_nothing_is_removed_from_a_sharp_clip_that_stands_still():
     frames, flows = still_clip(SCENES["camera"](128, 128))
     image = frames.mean(axis=0)
     witnesses = measure_witnesses(frames, flows, image, BlurWitnesses(0.0, 12.0))
-    result = finish(remove_blur_steps(image, image, witnesses=witnesses))
+    found = find_blur(image, DeconvolutionParams(), DEFAULT, witnesses)
+    result = finish(remove_blur_steps(image, image, found=found))
     assert result.deconvolution.sigma == 0 and result.posterior.removed == 0
     np.testing.assert_array_equal(result.deconvolution.image, np.clip(image, 0, 1))
     assert "removing one would not be seen to improve it" in result.decisions[0].reason

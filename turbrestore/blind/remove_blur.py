@@ -44,6 +44,9 @@ SMALLEST_SIDE = 4 * HALO
 # More threads than these take no more memory.
 MOST_THREADS = 4
 
+# What the image alone tells, and what the image and the frames tell; None where it is not asked.
+FoundBlur = tuple[BlurEstimate | None, BlurPosterior | None]
+
 
 @dataclass(frozen=True)
 class Deblurred:
@@ -75,7 +78,7 @@ def remove_blur_steps(
     guards: GuardParams | None = None,
     runtime: Runtime = DEFAULT,
     side: int | None = None,
-    witnesses: BlurWitnesses | None = None,
+    found: FoundBlur | None = None,
     psf: Float64Array | None = None,
     photons: NoiseCurve | None = None,
     full_scale: tuple[float, float] = (0.0, 1.0),
@@ -83,15 +86,15 @@ def remove_blur_steps(
 ) -> Steps[Deblurred]:
     """Remove a blur step by step; see :func:`remove_blur`.
 
-    With ``side`` the image is deconvolved in tiles of at most that side, pixels, which takes less memory.  Where there
-    are ``witnesses``, the frames tell the blur together with the image.  ``psf`` (h, w) is the point spread
-    function, if it is known.  ``photons`` is the noise of the image at every level, relative to its mean;
-    ``full_scale`` is black and white, and ``noise`` the spectrum of the noise of the image.
+    With ``side`` the image is deconvolved in tiles of at most that side, pixels, which takes less memory.  The blur
+    is the one ``found``, by default by the image alone; ``psf`` (h, w) is the point spread function, if it is known.
+    ``photons`` is the noise of the image at every level, relative to its mean; ``full_scale`` is black and white, and
+    ``noise`` the spectrum of the noise of the image.
     """
     params, guards = deconvolution or DeconvolutionParams(), guards or GuardParams()
     if psf is not None:
         params = replace(params, sigma=read_blur(psf)[1])
-    blur, posterior = find_blur(image, params, runtime, witnesses, noise)
+    blur, posterior = found or find_blur(image, params, runtime, None, noise)
     if posterior is None:
         sigma, params = blur_to_remove(blur, params)
     else:
@@ -198,7 +201,7 @@ def find_blur(
     runtime: Runtime,
     witnesses: BlurWitnesses | None,
     noise: NoiseSpectrum | None = None,
-) -> tuple[BlurEstimate | None, BlurPosterior | None]:
+) -> FoundBlur:
     """Estimate the blur by the image, and by the frames where there are witnesses."""
     if params.sigma is not None:
         return None, None

@@ -26,6 +26,7 @@ _STAGE_NAMES = {
     "filter": "Alternating filter",
     "noise": "Noise of the halves",
     "witnesses": "Witnesses of the blur",
+    "width": "Width of the blur",
     "deconvolve": "Deconvolution",
     "agreement": "Agreement of the halves",
     "uncertainty": "Uncertainty",
