@@ -75,15 +75,15 @@ def test_every_doubt_is_named_once_with_a_remedy(restoration):
     assert f"{frames} frames" in restoration.verdict.gained
 
 
-def test_a_remedy_names_the_width_that_was_measured(restoration):
-    changed = replace(
-        restoration,
-        deconvolution=replace(restoration.deconvolution, sigma=0.0),
-        posterior=widths(restoration, 0.61, 0.93, 1.2),
-    )
+@pytest.mark.parametrize(
+    ("sigma", "text"), [(0.0, "no blur is removed, although 0.70 "), (0.2, "0.20 pixels of blur are removed")]
+)
+def test_a_remedy_names_the_width_that_the_guards_took_back(restoration, sigma, text):
+    posterior = replace(widths(restoration, 0.61, 0.93, 1.2), removed=0.7)
+    changed = replace(restoration, deconvolution=replace(restoration.deconvolution, sigma=sigma), posterior=posterior)
     (check,) = changed.verdict.checks
-    assert check.text == "no blur is removed, although 0.93 pixels were measured (0.61 to 1.20)"
-    assert check.remedy.startswith("--sigma 0.93 ")
+    assert check.text.startswith(text) and "0.93" not in str(check)
+    assert check.remedy.startswith("--sigma 0.70 ")
 
 
 def test_a_blur_whose_removal_would_not_be_seen_is_no_doubt(restoration):

@@ -263,10 +263,9 @@ def _checks_of_blur(restoration: Restoration) -> Iterator[Check]:
         yield write_check(CheckKind.BLUR_UNKNOWN)
         return
     # Nothing is wrong where removing a blur would not be seen to help: such clips are bad no more often than others.
-    if removed < _HALF * restoration.posterior.removed:
-        kind = CheckKind.BLUR_LEFT if removed > 0 else CheckKind.NO_BLUR_REMOVED
-        low, width, high = map(float, restoration.posterior.width)
-        yield write_check(kind, width, low, high, removed)
+    decided = float(restoration.posterior.removed)
+    if removed < _HALF * decided:
+        yield write_check(CheckKind.BLUR_LEFT if removed > 0 else CheckKind.NO_BLUR_REMOVED, decided, removed)
 
 
 def _share_of_air(flows: FloatArray) -> float:

@@ -68,11 +68,11 @@ _CHECKS = {
     ),
     CheckKind.UNSEEN: ("{0} of the image is seen in hardly any frame", "--border crop"),
     CheckKind.NO_BLUR_REMOVED: (
-        "no blur is removed, although {0:.2f} pixels were measured ({1:.2f} to {2:.2f})",
+        "no blur is removed, although {0:.2f} pixels were to be: the guards against ringing and noise forbid it",
         "--sigma {0:.2f} removes it; ignore this if edges ring then",
     ),
     CheckKind.BLUR_LEFT: (
-        "{3:.2f} pixels of blur are removed, although {0:.2f} were measured ({1:.2f} to {2:.2f})",
+        "{1:.2f} pixels of blur are removed, although {0:.2f} were to be: the guards against ringing and noise forbid more",
         "--sigma {0:.2f} removes all; ignore this if edges ring then",
     ),
     CheckKind.BLUR_UNKNOWN: (
