@@ -238,11 +238,13 @@ def _checks(restoration: Restoration, motion: float) -> Iterator[Check]:
     period, largest = repetition(restoration.mean), _LARGEST * of_air * motion / math.sqrt(2)
     if period < 2 * largest:
         yield write_check(CheckKind.REPETITION, period, largest)
-    error = of_air * mean_flow_error(restoration.dynamics, int(np.isfinite(filtered.sharpness).sum()))
-    if restoration.frame_count < FEW:
-        yield write_check(CheckKind.FEW_FRAMES, counted(restoration.frame_count, "frame"), error, FEW)
+    # Frames that were not kept make neither the image nor its geometry.
+    kept = int(np.isfinite(filtered.sharpness).sum())
+    error = of_air * mean_flow_error(restoration.dynamics, kept)
+    if kept < FEW:
+        yield write_check(CheckKind.FEW_FRAMES, counted(kept, "frame"), error, FEW)
     elif error > _SEEN_BEND:
-        yield write_check(CheckKind.GEOMETRY, error, counted(restoration.frame_count, "frame"))
+        yield write_check(CheckKind.GEOMETRY, error, counted(kept, "frame"))
     if structure is not None and structure.left > _HALF:
         yield write_check(CheckKind.MOTION, structure.left)
     if (disputed := _disputed(restoration)) > _HALF:
