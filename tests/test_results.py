@@ -82,7 +82,7 @@ def test_every_doubt_is_named_once_with_a_remedy(restoration):
 
 
 @pytest.mark.parametrize(
-    ("sigma", "text"), [(0.0, "no blur is removed, although 0.70 "), (0.2, "0.20 pixels of blur are removed")]
+    ("sigma", "text"), [(0.0, "no blur is removed, although 0.70 "), (0.2, "0.20 of 0.70 pixels of blur are removed")]
 )
 def test_a_remedy_names_the_width_that_the_guards_took_back(restoration, sigma, text):
     posterior = replace(widths(restoration, 0.61, 0.93, 1.2), removed=0.7)

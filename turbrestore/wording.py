@@ -33,7 +33,7 @@ _CHECKS = {
     CheckKind.INPUT: ("{0}", "ignore this if it is what you expect"),
     CheckKind.WATERMARK: (
         "a half-transparent mark lies over the scene and is restored poorly",
-        "--roi X,Y,WIDTH,HEIGHT leaves it out; --static-mask FILE fills what it names, where the camera moves",
+        "leave it out with --roi X,Y,WIDTH,HEIGHT; where the camera moves, --static-mask FILE fills what it names",
     ),
     CheckKind.TWO_STATES: ("a part of the scene switches between two states, and the image may mix them", "{0}"),
     CheckKind.SATURATED: ("{0}", "expose shorter; ignore this where what is white has no detail"),
@@ -72,7 +72,7 @@ _CHECKS = {
         "--sigma {0:.2f} removes it; ignore this if edges ring then",
     ),
     CheckKind.BLUR_LEFT: (
-        "{1:.2f} pixels of blur are removed, although {0:.2f} were to be: the guards against ringing and noise forbid more",
+        "{1:.2f} of {0:.2f} pixels of blur are removed: the guards against ringing and noise forbid more",
         "--sigma {0:.2f} removes all; ignore this if edges ring then",
     ),
     CheckKind.BLUR_UNKNOWN: (

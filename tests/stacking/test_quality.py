@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from conftest import natural_scene
-from turbrestore.io.video import write_video
 from turbrestore.footage.frame_selection import best_frames
+from turbrestore.io.video import write_video
 from turbrestore.stacking.quality import KeptShare, quality_list, quality_table
 
 
@@ -51,7 +51,8 @@ def test_the_suggested_share_rises_with_noise_and_is_worth_most():
 
 
 @pytest.mark.parametrize(
-    ("frames", "of", "percent"), [(104, 1000, 11), (1, 1000, 1), (4, 33, 12), (55, 100, 55), (8, 30, 27), (300, 300, 100)]
+    ("frames", "of", "percent"),
+    [(104, 1000, 11), (1, 1000, 1), (4, 33, 12), (55, 100, 55), (8, 30, 27), (300, 300, 100)],
 )
 def test_whole_percent_keep_no_fewer_frames(frames, of, percent):
     assert KeptShare(frames / of, frames, 1.0, 1.0, 1.0).percent == percent
