@@ -93,6 +93,13 @@ class TestSteady:
         assert (tab.steadied, list(tmp_path.iterdir())) == (None, [])
         tab.close()
 
+    def test_doubts_about_the_clip_are_in_the_verdict(self, tmp_path):
+        np.save(tmp_path / "a.npy", np.random.default_rng(0).uniform(0, 1, (48, 64, 5)).astype(np.float32))
+        tab = Tab(Folders(tmp_path))
+        job = ended(tab.steady(SteadyOrder(tmp_path / "a.npy", tmp_path / "a.mp4")))
+        assert "; check: its axes are taken for " in job.message
+        tab.close()
+
     def test_options_are_those_of_the_command(self, folder, tmp_path):
         params = SteadyParams(camera="steady", sigma=0.8, reach=6, largest=3.5)
         selection, written = Selection(frames="0:4"), Output("hevc", 20)
