@@ -277,6 +277,8 @@ def test_several_clips_and_a_steadied_video(open_tab, app):
         assert page.evaluate(grey, "input") != page.evaluate(grey, "output")
         page.reload()
         page.wait_for_function(f"({playing}) === 128", timeout=LONG)
+        assert page.get_by_label("Command of the video").inner_text() == command
+        assert page.get_by_label("Reach, frames").input_value() == "6"
         rows.nth(1).wait_for()
         assert rows.count() == 2
         press(page, "Clip")
@@ -287,6 +289,9 @@ def test_several_clips_and_a_steadied_video(open_tab, app):
         shutil.rmtree(app.folder / "restored")
         for path in app.folder.glob("small.steady.*"):
             path.unlink()
+    open_another(page, "small.mkv", 8)
+    assert not page.get_by_label("Command of the video").is_visible()
+    assert page.get_by_label("Reach, frames").input_value() == "12"
 
 
 def test_a_run_is_stopped_and_another_tab_goes_on(open_tab, app):
