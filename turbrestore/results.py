@@ -85,7 +85,7 @@ class Restoration:
         frames.  Moving objects are not in it.
     centroid : Centroid
     dynamics : FlowDynamics or None
-        Where frames are processed in tiles it is for the record: the filter has a model of each tile.
+        Where frames are processed in tiles it is for information only: each tile has its own model.
     filtered : Filtered or None
         Recentred: its image is at the mean geometry of all frames; the centroid and its flows are at that of the
         training frames.

@@ -111,7 +111,7 @@ def explain_training(train: int, frame_count: int, wanted: int | None) -> Decisi
     elif train == half:
         reason = "half of the clip"
     elif train > half:
-        reason = "more than half of a short clip"
+        reason = "the motion of a short clip is learnt from more than half of it"
     else:
         reason = "half of the clip exceeds the default limit, or the memory"
     return Decision("training", f"first {train} of {frame_count} frames", reason)

@@ -259,7 +259,7 @@ def _measured_and_expected(
 def displacement_likelihood(
     grid: Hypotheses, variance: float, independent_frames: float, scale: int, spread: float | None = None
 ) -> Float64Array:
-    """Log likelihood of V, in pixels of the image, for every air in reduced pixels; 0 where V is not grid.
+    """Log likelihood of V, in pixels of the image, for every air in reduced pixels; 0 where V is unknown.
 
     ``spread`` is the standard deviation of ln V; by default that of an unknown outer scale.
     """
