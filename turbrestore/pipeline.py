@@ -66,8 +66,8 @@ def restore(
 ) -> Restoration:
     """Restore one image from frames of a static scene.
 
-    Frames are read in order: a sample of them to survey the clip, all of them once more if there are moving
-    objects, then the training frames, and those after them by the filter.  Only the training frames are kept, in
+    Frames are read in order: all of them to survey the clip, once more if there are moving objects, then the
+    training frames, and those after them by the filter.  Only the training frames are kept, in
     memory or, if they do not fit, in a scratch file.
 
     Parameters

@@ -147,7 +147,6 @@ def test_weights_and_quantiles_are_in_order():
     known = hypotheses()
     assert np.exp(known.prior).sum() == pytest.approx(1)
     found = blur_posterior(None, BlurWitnesses(0.7, 30.0, variation=variation))
-    assert (found.lowest <= found.highest).all() and found.transfer[0] == pytest.approx(1)
     assert np.isnan(found.by_image).all()
     for quantiles in (found.width, found.by_displacement, found.by_variation):
         assert (np.diff(quantiles) >= 0).all()

@@ -83,7 +83,7 @@ def test_a_folder_of_an_earlier_layout_starts_again(whole, ended, monkeypatch, c
     for reading in record["deblurred"]["readings"]:
         del reading["ringing"]
     path.write_text(json.dumps(record | {"schema": 2}))
-    with pytest.raises(DataError, match="layout 5, found layout 2"):
+    with pytest.raises(DataError, match="layout 6, found layout 2"):
         load_run("kept")
     called = spy(monkeypatch)
     assert main([*WORDS, "--resume", "--overwrite"]) == 0

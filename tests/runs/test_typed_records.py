@@ -8,7 +8,6 @@ from turbrestore.blind.guards import GuardReading
 from turbrestore.core.errors import DataError
 from turbrestore.registration.centroid import CentroidParams
 from turbrestore.results import Restoration
-from turbrestore.runs.run_files import read_stages
 from turbrestore.runs.typed_records import KeptRecord, convert_to
 from turbrestore.seeing.strength import Estimate, Seeing
 
@@ -43,8 +42,3 @@ def test_a_message_names_the_place_what_was_expected_and_what_was_found():
         with pytest.raises(DataError) as caught:
             convert_to(kind, found, "run.json")
         assert str(caught.value).startswith(f"run.json: {told}"), caught.value
-
-
-def test_a_record_of_an_earlier_version_has_an_empty_part_for_a_deblurring_to_come(tmp_path):
-    (tmp_path / "run.json").write_text('{"schema": 5, "facts": {"centroid": {}}, "deblurred": {}, "outputs": []}')
-    assert read_stages(tmp_path) == KeptRecord({"centroid": {}})

@@ -1,1 +1,1 @@
-"""Blind deconvolution: estimate the blur, map how it varies, remove it, and check the result."""
+"""Blind deconvolution: estimate the blur, remove it, and check the result."""

@@ -42,7 +42,7 @@ from ..core.noise_spectrum import NoiseSpectrum
 from ..registration.registered_noise import noise_of_frames
 from ..runtime.runtime import DEFAULT, Runtime
 from .learnt import blur_features, learnt_blur
-from .psf import Float64Array, radial_otf
+from .psf import Float64Array
 from .witnesses.hypotheses import LEAST_TRANSFER, Hypotheses, hypotheses, shapes
 from .witnesses.image_evidence import EXPONENTS, ImageEvidence, image_evidence
 from .witnesses.short_exposure import TILT_SPREAD
@@ -100,19 +100,6 @@ class BlurPosterior:
     by_image: Float64Array
     air: float  # probability that the air has blurred the image
     edge_limited: bool  # whether less is removed because the edges of the image are too steep for more
-    frequencies: Float64Array  # (k,): of the arrays that follow, cycles per pixel
-    # (k,): transfer function, and its 16 % and 84 % quantiles; of a fused image, those of the quantiles of the width.
-    transfer: Float64Array
-    lowest: Float64Array
-    highest: Float64Array
-    # (k,): s, its error, and what the posterior expects; NaN where the signal is lost in noise.
-    variation: Float64Array
-    variation_error: Float64Array
-    expected_variation: Float64Array
-    # (k,): the same of s_4.
-    power_variation: Float64Array
-    power_variation_error: Float64Array
-    expected_power_variation: Float64Array
 
 
 def measure_witnesses(frames: FloatArray, flows: FloatArray, mean: FloatArray, known: BlurWitnesses) -> BlurWitnesses:
@@ -153,16 +140,7 @@ def estimate_posterior(
     facts = by_theory.air, by_theory.exponent, witnesses.displacement, witnesses.independent_frames
     features = blur_features(image, np.array(widths), variation, ratio, evidence, noise, facts)
     found = learnt_blur(features, float(by_theory.width[1]), exponent=exponent)
-    highest, transfer, lowest = (radial_otf(by_theory.frequencies, width, found.exponent) for width in found.width)
-    return evidence, replace(
-        by_theory,
-        removed=found.removed,
-        exponent=found.removed_exponent,
-        width=found.width,
-        transfer=transfer,
-        lowest=lowest,
-        highest=highest,
-    )
+    return evidence, replace(by_theory, removed=found.removed, exponent=found.removed_exponent, width=found.width)
 
 
 def blur_posterior(
@@ -198,7 +176,6 @@ def blur_posterior(
 
     curves = np.array([np.interp(RINGS * kappa, RINGS, curve) for curve in grid.transfer.reshape(-1, len(RINGS))])
     mean = np.exp(weights.ravel() @ np.log(np.maximum(curves, LEAST_TRANSFER)))
-    low, _, high = np.array([_quantiles(column, weights.ravel()) for column in curves.T]).T
     return BlurPosterior(
         removed=0.0,
         exponent=float(shapes(mean[None])[1][0]),
@@ -208,11 +185,6 @@ def blur_posterior(
         by_image=quantiles(of_image),
         air=float(1 - weights[-1].sum()),
         edge_limited=False,
-        frequencies=RINGS / scale,
-        transfer=mean,
-        lowest=low,
-        highest=high,
-        **_measured_and_expected(grid, variation, weights),
     )
 
 
@@ -236,30 +208,10 @@ def _quantiles(widths: Float64Array, weights: Float64Array) -> Float64Array:
     return np.interp(_QUANTILES, np.cumsum(weights.ravel()[order]), widths.ravel()[order])
 
 
-def _measured_and_expected(
-    grid: Hypotheses, measured: SpectralVariation | None, weights: Float64Array
-) -> dict[str, Float64Array]:
-    """Return s and s_4 as measured and as the posterior expects them, for the usual g and τ."""
-    gaps = np.full(len(RINGS), np.nan)
-    names = ("variation", "power_variation")
-    found = {key: gaps for name in names for key in (name, f"{name}_error", f"expected_{name}")}
-    if measured is None:
-        return found
-    rings = clear_rings(measured)
-    share, shift = float(np.exp(SHARE_PRIOR[0])), float(np.exp(SHIFT_PRIOR[0]))
-    values = ((measured.amplitude, measured.amplitude_error), (measured.power, measured.power_error))
-    for kind, (name, (value, error)) in enumerate(zip(names, values, strict=True)):
-        predicted = np.tensordot(weights, expected(grid, kind, rings, share, shift, measured.stretch))
-        for key, figure in ((name, value[rings]), (f"{name}_error", error[rings]), (f"expected_{name}", predicted)):
-            found[key] = gaps.copy()
-            found[key][rings] = figure
-    return found
-
-
 def displacement_likelihood(
     grid: Hypotheses, variance: float, independent_frames: float, scale: int, spread: float | None = None
 ) -> Float64Array:
-    """Log likelihood of V, in pixels of the image, for every air in reduced pixels; 0 where V is unknown.
+    """Log likelihood of V, in pixels of the image, for every air in reduced pixels; 0 where V is not finite.
 
     ``spread`` is the standard deviation of ln V; by default that of an unknown outer scale.
     """

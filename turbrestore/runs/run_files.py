@@ -23,7 +23,7 @@ from .run_record import RunRecord
 from .stage_files import KINDS, load_artifact, save_artifact
 from .typed_records import KeptRecord, convert_to
 
-SCHEMA = 5
+SCHEMA = 6
 RECORD, IMAGES, MEAN = "run.json", "images.npz", "mean.npy"
 # All files of a kept run.
 RUN_FILES = (*(f"{name}.npz" for name in KINDS), MEAN, IMAGES, RECORD)
@@ -118,8 +118,7 @@ def read_record(folder: Path) -> KeptRecord | None:
     layout = found.get("schema")
     if layout != SCHEMA:
         raise DataError(f"{path}: expected the record of a run, layout {SCHEMA}, found layout {layout!r:.40}")
-    # An earlier version wrote an empty part where nothing was deblurred.
-    return convert_to(KeptRecord, {**found, "deblurred": found.get("deblurred") or None}, str(path))
+    return convert_to(KeptRecord, found, str(path))
 
 
 def read_stages(folder: str | os.PathLike[str]) -> KeptRecord | None:

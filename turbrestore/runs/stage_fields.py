@@ -102,12 +102,6 @@ FIELDS: dict[str, dict[str, ArraySpec | NumberSpec]] = {
         "width": ArraySpec("f8", "3", low=0),
         **dict.fromkeys(("by_displacement", "by_variation", "by_image"), ArraySpec("f8", "3", low=0, gaps=True)),
         "air": NumberSpec(high=1 + _ROUNDING),
-        **dict.fromkeys(("frequencies", "transfer", "lowest", "highest"), ArraySpec("f8", "k", low=0)),
-        **{
-            f"{prefix}{name}{suffix}": ArraySpec("f8", "k", gaps=True)
-            for name in ("variation", "power_variation")
-            for prefix, suffix in (("", ""), ("", "_error"), ("expected_", ""))
-        },
     },
 }
 
