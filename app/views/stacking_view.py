@@ -130,10 +130,11 @@ class StackingView:
                 ui.label(words).classes("what")
             suggested = () if found.suggested is None else (found.suggested,)
             for one in (*found.kept, *suggested):
-                button = ui.button(f"{one.percent} %", on_click=partial(self._keep.set_value, one.percent))
+                percent = one.percent
+                button = ui.button(f"{percent} %", on_click=partial(self._keep.set_value, percent))
                 button.props("outline dense no-wrap")
                 if one is found.suggested:
-                    button.props(f'aria-label="{one.percent} %, suggested"')
+                    button.props(f'aria-label="{percent} %, suggested"')
                 for words in (str(one.frames), f"{one.noise:.2f}×", f"{one.sharpness:.2f}×", f"{one.worth:.2f}×"):
                     ui.label(words)
         said = "The last row is suggested." if suggested else "All frames are worth as much as any share."
