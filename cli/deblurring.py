@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,13 +11,14 @@ import numpy as np
 from cyclopts import Parameter
 
 from turbrestore.blind.guards import GuardParams, evaluate_guards
-from turbrestore.blind.remove_blur import remove_blur_steps
+from turbrestore.blind.remove_blur import SIGMAS_A_SIDE, remove_blur_steps
 from turbrestore.blur.measured_psf import psf_from_image
+from turbrestore.blur.posterior import BlurPosterior
 from turbrestore.core.arrays import FloatArray, luminance
 from turbrestore.core.errors import ConfigurationError, require, require_between
 from turbrestore.core.gradient import sobel_gradient
 from turbrestore.core.remarks import counted
-from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+from turbrestore.deconvolution.deconvolve import Deconvolution, DeconvolutionParams
 from turbrestore.deconvolution.deconvolve import deconvolve as deconvolve_image
 from turbrestore.display.figure import new_figure
 from turbrestore.display.maps import plot_images
@@ -24,6 +26,7 @@ from turbrestore.io.images.image_files import read_image
 from turbrestore.io.limits import Limits
 from turbrestore.io.output import IMAGE_OUTPUT_SUFFIXES, check_output
 from turbrestore.io.pixels import check_depth
+from turbrestore.runs.stage_files import load_artifact
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.steps import finish, step_counter
 
@@ -38,8 +41,6 @@ if TYPE_CHECKING:
 
 # Side of the part that a contact sheet shows, pixels; most widths, and panels in a row.
 PART, MOST_WIDTHS, COLUMNS = 256, 12, 4
-# Largest width, pixels, in shares of the side of the image, as for a restoration.
-_SIGMAS_A_SIDE = 8
 
 
 def deconvolve(
@@ -64,12 +65,14 @@ def deconvolve(
     Parameters
     ----------
     input : Path
-        Image, stage file, or folder of a kept run.  Of a run the filtered image is deblurred, guided by the centroid.
+        Image, stage file, or folder of a kept run.  Of a run the filtered image is deblurred, guided by the centroid,
+        by the width that the run removed.
     output : Path
         Image (.png, .tif) or stage file (.npz) to write.  With --sweep a contact sheet, .png, by default sweep.png in
         the folder of the run.
     sigma : float
-        Width of the blur, pixels.  A Gaussian unless --deconvolution.exponent says otherwise; estimated by default.
+        Width of the blur, pixels.  A Gaussian unless --deconvolution.exponent says otherwise; by default that of the
+        run, else estimated.
     psf : Path
         Image of a star, or a measured point spread function, in pixels of the input.  It is removed instead of a blur
         of some width.
@@ -106,6 +109,8 @@ def deconvolve(
     require(output is not None, "OUTPUT: expected an image or a stage file to write, found none")
     assert output is not None
     deconvolution = known_sigma(sigma, deconvolution)
+    if input.is_dir() and psf is None and deconvolution.sigma is None:
+        deconvolution = _as_in_run(input, deconvolution)
     require(psf is None or deconvolution.sigma is None, "--psf: contradicts --sigma; leave one of them out")
     if bit_depth is not None:
         check_depth(bit_depth)
@@ -136,6 +141,15 @@ def stage_of_run(path: Path) -> tuple[Path, Path | None]:
     return filtered, centroid
 
 
+def _as_in_run(folder: Path, params: DeconvolutionParams) -> DeconvolutionParams:
+    """Complete settings by the blur that the run removed, if it measured one: it knows the frames as well."""
+    done, posterior = folder / "deconvolution.npz", folder / "posterior.npz"
+    if not (done.is_file() and posterior.is_file()):
+        return params
+    exponent = params.exponent or load_artifact(posterior, BlurPosterior).exponent
+    return replace(params, sigma=load_artifact(done, Deconvolution).sigma, exponent=exponent)
+
+
 def widths_of(sweep: str, shape: tuple[int, ...], name: str = "--sweep") -> tuple[float, ...]:
     """Read widths for an image of this shape that are separated by commas; ``name`` is what errors call them."""
     try:
@@ -144,7 +158,7 @@ def widths_of(sweep: str, shape: tuple[int, ...], name: str = "--sweep") -> tupl
         raise ConfigurationError(f"{name}: expected widths such as 1,1.4,2, found {sweep!r}") from None
     require(len(widths) <= MOST_WIDTHS, f"{name}: expected at most {MOST_WIDTHS} widths, found {len(widths)}")
     for width in widths:
-        require_between(name, width, 0, min(shape[:2]) / _SIGMAS_A_SIDE, "pixels")
+        require_between(name, width, 0, min(shape[:2]) / SIGMAS_A_SIDE, "pixels")
     return widths
 
 

@@ -123,7 +123,7 @@ def test_progress_reaches_every_stage(blurred):
     sharper = replace(QUICK, deconvolution=DeconvolutionParams(sigma=1.1))
     seen = {}
     restore(blurred.frames[:6], sharper, progress=lambda stage, done, total: seen.__setitem__(stage, (done, total)))
-    assert set(seen) == {"centroid", "filter", "deconvolve"}
+    assert set(seen) == {"read", "centroid", "filter", "deconvolve"}
     assert all(0 < done <= total for done, total in seen.values())
     assert seen["filter"][0] == seen["filter"][1]
 

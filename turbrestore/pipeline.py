@@ -130,7 +130,7 @@ def restore(
     _check_training(params, plan.train, len(source))
     if plan.runtime.scratch is not None:
         check_space(plan.runtime.scratch, plan.scratch_bytes)
-    prepared = prepare(source, params.static_mask, plan.runtime.scratch)
+    prepared = prepare(source, params.static_mask, plan.runtime.scratch, progress)
     if store is not None:
         store.set_levels(prepared.levels)
     stretched = _stretched_params(params, prepared.levels)
@@ -262,6 +262,8 @@ def _remove_blur(
     params, plan, guide = run.params, run.plan, fused.centroid.image
     if fused.filtered is not None:
         guide = recentre(guide, fused.filtered.mean_flow)
+    if run.progress is not None and evidence.witnesses is not None:
+        run.progress("width", 0, 1)
     settings = params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side
     full_scale = run.prepared.levels.full_scale
     steps = remove_blur_steps(

@@ -29,6 +29,7 @@ from .footage.sensor.stripes import find_stripes
 from .footage.survey import Survey, take_survey
 from .io.source import FrameSource, Window
 from .results import Restoration, at_levels_of_clip
+from .runtime.steps import Progress
 
 Find = Callable[[Survey], Correction | None]
 
@@ -73,9 +74,12 @@ class Prepared:
         return (each.put_back for each in reversed(self.corrections) if each.put_back is not None)
 
 
-def prepare(source: FrameSource, static_mask: str = "auto", scratch: Path | None = None) -> Prepared:
+def prepare(
+    source: FrameSource, static_mask: str = "auto", scratch: Path | None = None, progress: Progress | None = None
+) -> Prepared:
     """Prepare the frames of a clip, which are read once, and once more if there are moving objects."""
-    finds, survey, corrections = _detectors(static_mask, source), take_survey(source, scratch), list[Correction]()
+    finds, corrections = _detectors(static_mask, source), list[Correction]()
+    survey = take_survey(source, scratch, progress)
     for find in finds:
         correction = find(survey)
         if correction is not None:

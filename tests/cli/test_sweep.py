@@ -6,8 +6,9 @@ from command_line import QUICK, fails
 
 from conftest import SCENES, blurred
 from turbrestore.blind.guards import GuardParams
-from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+from turbrestore.deconvolution.deconvolve import Deconvolution, DeconvolutionParams
 from turbrestore.io.images.image_files import read_image, write_image
+from turbrestore.runs.stage_files import load_artifact
 from turbrestore.runtime.runtime import DEFAULT
 from turbrestore_cli.deblurring import PART, contact_sheet, detailed_window
 
@@ -60,3 +61,12 @@ def test_the_part_shown_is_the_one_with_edges():
     rows, columns = detailed_window(image)
     assert rows.start <= PART + 40 and rows.stop >= PART + 200
     assert columns.start <= 2 * PART + 40 and columns.stop >= 2 * PART + 200
+
+
+def test_a_kept_run_is_deblurred_by_the_width_that_it_removed(run, clip, tmp_path):
+    kept = tmp_path / "run"
+    assert run("restore", clip, tmp_path / "a.png", "--keep", kept, *QUICK)[0] == 0
+    removed = load_artifact(kept / "deconvolution.npz", Deconvolution).sigma
+    code, _, err = run("deconvolve", kept, tmp_path / "b.npz", "--deconvolution.iterations", "3")
+    assert code == 0, err
+    assert removed > 0 and load_artifact(tmp_path / "b.npz", Deconvolution).sigma == removed

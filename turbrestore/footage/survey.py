@@ -23,6 +23,7 @@ from ..io.source import FrameSource
 from ..registration.camera.global_shift import LONGEST_SIDE
 from ..registration.flow import MIN_SIDE
 from ..runtime.scratch import drop_pages, iter_frames, new_stack
+from ..runtime.steps import Progress, step_counter
 from .correction import Correction
 
 # Most frames that are kept whole, and fewest, which tell what stays from what moves; those beyond take at most so many
@@ -68,13 +69,15 @@ class Survey:
         return dataclasses.replace(self, clip=self.clip.adjusted(correction.apply), small=small)
 
 
-def take_survey(clip: FrameSource, scratch: Path | None = None) -> Survey:
+def take_survey(clip: FrameSource, scratch: Path | None = None, progress: Progress | None = None) -> Survey:
     """Read the frames of a clip once; whole ones are kept in memory or, if there is a folder, in a scratch file."""
+    told = step_counter(progress, "read", len(clip))
     small = np.empty(_small_shape(clip.shape), np.float32)
     size, places, stack = (small.shape[2], small.shape[1]), list[int](), np.empty(0)
     for index, (number, pixels) in enumerate(zip(clip.numbers, clip.native(), strict=True)):
         values = clip.intensities(number, pixels)
         small[index] = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
+        told(values)
         if not places:
             dtype = pixels.dtype if pixels.dtype.kind == "u" else np.dtype(np.float32)
             places = spread(len(clip), _whole_frames(clip.shape, dtype.itemsize))
