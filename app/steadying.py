@@ -105,7 +105,7 @@ def steady_order(order: SteadyOrder, job: Job[object], film_path: Path) -> Stead
     order.check()
     source, report = open_checked(order.path, order.selection)
     source = clean_source(source, keep_all(report))
-    machine, fps, figures = Machine(), source.fps or USUAL_RATE, SteadyFigures()
+    machine, fps, figures = Machine(), source.fps or USUAL_RATE, SteadyFigures(remarks=source.warnings)
     images = _images(source, order.params, machine, job, figures)
     encoding = order.written.encoding()
     write_video(order.output, images, fps, source.bit_depth, order.overwrite, encoding, companion=source)

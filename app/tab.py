@@ -53,6 +53,8 @@ class Tab:
         What the user has chosen of the border.
     ordered : Order or None
         What was ordered last of the clip, as the form says it.
+    ordered_video : SteadyOrder or None
+        The steadied video of the clip that was ordered last.
     steadied : Steadied or None
         The newest steadied video of the clip.
     films : dict of str to Path
@@ -70,6 +72,7 @@ class Tab:
         self.job: Job[object] | None = None
         self.restored: Restored | None = None
         self.ordered: Order | None = None
+        self.ordered_video: SteadyOrder | None = None
         self.tuned: DeconvolutionParams | None = None
         self.border: Literal["keep", "crop"] = "keep"
         self.steadied: Steadied | None = None
@@ -99,7 +102,7 @@ class Tab:
             clip = open_clip(path, Path(path.name) if uploaded else self.folders.shown(path))
             self.stop()
             self.clip, self.job, self.restored, self.ordered = clip, None, None, None
-            self.tuned, self.border, self.steadied = None, "keep", None
+            self.tuned, self.border, self.steadied, self.ordered_video = None, "keep", None, None
         finally:
             self._opening -= 1
         return clip
@@ -156,7 +159,9 @@ class Tab:
 
     def steady(self, order: SteadyOrder) -> Job[Steadied]:
         """Steady the clip in a thread; the video becomes that of the tab when it is done."""
-        film = self._next_film()
+        film, self.ordered_video = self._next_film(), order
+        # Its frames and its region are those of the form for restorations.
+        self.ordered = dataclasses.replace(self.ordered or Order(order.path), selection=order.selection)
 
         def work(job: Job[Steadied]) -> Steadied:
             steadied = steady_order(order, job, film)

@@ -3,7 +3,7 @@
     python benchmarks/oracles.py --write benchmarks/results/oracles.md
 
 Scenes that no constant was set on are moved by smooth random flows behind a lens, with one thing at a time made worse.
-An oracle gives the product something that a recording does not tell.  ``--quick`` takes one scene.
+The versions that are compared are told the true motion or the true blur.  ``--quick`` takes one scene.
 """
 
 from __future__ import annotations

@@ -22,7 +22,19 @@ from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.runtime.threads import available_cores
 from turbrestore.settings import Preset, RestoreParams
 
-from .batch_plan import JOURNAL, TABLE, figures, find_clips, journal_line, key_of, name_outputs, plan, write_summary
+from .batch_plan import (
+    JOURNAL,
+    PAGE,
+    TABLE,
+    figures,
+    find_clips,
+    journal_line,
+    key_of,
+    name_outputs,
+    plan,
+    write_summary,
+    writes_page,
+)
 from .clip import Order, restore_clip
 from .cluster import check_cluster, connected
 from .inputs import with_absolute_paths
@@ -133,6 +145,8 @@ def batch(
         if missing and not parallel:
             say(f"one clip after the other; {install_command('distributed')} lets them run side by side", quiet)
         _do(rows, missing, out, scheduler, count if parallel else 0, quiet)
+    if not writes_page():
+        say(f"{out / PAGE}: not written; {install_command('report')} installs what it needs", quiet)
     failed = [row for row in rows if row.state != "done"]
     if json:
         print_json({"out": str(out), "clips": [figures(row) for row in rows]})

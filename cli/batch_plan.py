@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from turbrestore import __version__
 from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError, OutputError
+from turbrestore.core.verdict import RIGHT
 from turbrestore.io.folders import frame_files
 from turbrestore.io.limits import input_errors
 from turbrestore.io.output import atomic_write, check_output
@@ -142,13 +143,19 @@ def write_summary(out: Path, rows: Sequence[ClipRow]) -> None:
     writer.writeheader()
     for row in rows:
         done = row.state == "done"
-        writer.writerow({name: value if done or isinstance(value, str) else "" for name, value in figures(row).items()})
+        said = figures(row) | ({"checks": row.checks or RIGHT} if done else {})
+        writer.writerow({name: value if done or isinstance(value, str) else "" for name, value in said.items()})
     atomic_write(out / TABLE, table.getvalue().encode(errors="replace"), overwrite=True)
-    if find_spec("jinja2") is None:
+    if not writes_page():
         # That of an earlier batch would show other clips.
         (out / PAGE).unlink(missing_ok=True)
         return
     write_batch_page(out / PAGE, rows)
+
+
+def writes_page() -> bool:
+    """Tell whether the package is there that the page of a batch needs."""
+    return find_spec("jinja2") is not None
 
 
 def figures(row: ClipRow) -> dict[str, Any]:

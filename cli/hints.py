@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import glob
 import re
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 
 from cyclopts import UnknownOptionError
@@ -13,6 +13,7 @@ from cyclopts import UnknownOptionError
 # Share of letters that an option has in common with the one that is suggested; --verbose and --derotate have 0.53.
 _ALIKE = 0.7
 _MISSING = "no such file or folder"
+_NO_STREAM = "expected the name of a file; steady alone reads and writes standard streams"
 
 
 def unknown_option(error: UnknownOptionError) -> str:
@@ -21,11 +22,13 @@ def unknown_option(error: UnknownOptionError) -> str:
     if error.token.source == "cli" and (re.fullmatch(r"-[^-].*\.\w+", word) or Path(word).exists()):
         return f"{word}: taken for an option; write ./{word}, or -- before the paths"
     text, _, suggestion = str(error).partition(" Did you mean ")
-    alike = difflib.SequenceMatcher(None, word.lstrip("-"), suggestion.strip(" -?")).ratio()
-    return str(error) if alike >= _ALIKE else text
+    typed, known = word.lstrip("-"), suggestion.strip(" -?")
+    alike = difflib.SequenceMatcher(None, typed, known).ratio()
+    # Few people mistype the first letter, and --rotate asks for something else than --derotate does.
+    return str(error) if alike >= _ALIKE and typed[:1] == known[:1] else text
 
 
-def with_meaning(message: str, words: Iterable[str]) -> str:
+def with_meaning(message: str, words: Sequence[str]) -> str:
     """Show the path of a message as it was typed, and say what to do about an address, a pattern or a hyphen."""
     for word in words:
         name = str(Path(word))
@@ -33,7 +36,7 @@ def with_meaning(message: str, words: Iterable[str]) -> str:
             continue
         rest = message.removeprefix(f"{name}: ")
         if word == "-":
-            return f"{word}: {rest}; steady alone reads and writes standard streams"
+            return message if words[0] == "steady" else f"{word}: {_NO_STREAM}"
         return f"{word}: {rest}{_remedy(word) if rest == _MISSING else ''}"
     return message
 

@@ -136,7 +136,7 @@ def steady(
     companion = source.frames if isinstance(source.frames, FrameSource) else None
     encoding = _encoding_for(companion, encoding, output)
     _tell_lost_bits(source, written, encoding, output, quiet or piped_out)
-    facts, started = _Facts(verbose), time.monotonic()
+    facts, started = _Facts(verbose, () if companion is None else companion.warnings), time.monotonic()
     with tempfile.TemporaryFile() as masks:
         with progress_bars(quiet) as progress:
             total = len(companion) if companion is not None else 0
@@ -273,9 +273,9 @@ def _raw_shape(raw: str | None) -> tuple[int, ...] | None:
 class _Facts:
     """What is worth saying about a run."""
 
-    def __init__(self, verbose: bool) -> None:
+    def __init__(self, verbose: bool, remarks: tuple[str, ...]) -> None:
         self.verbose = verbose
-        self.figures = SteadyFigures()
+        self.figures = SteadyFigures(remarks=remarks)
 
     def watch(
         self, frames: Iterable[SteadyFrame], total: int, progress: Callable[[str, int, int], None] | None

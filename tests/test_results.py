@@ -42,6 +42,12 @@ def widths(restoration, low, width, high):
     return replace(restoration.posterior, width=np.array([low, width, high]), removed=width)
 
 
+def only(restoration, kept):
+    """The filtered image with the first frames alone."""
+    sharpness = np.where(np.arange(restoration.frame_count) < kept, restoration.filtered.sharpness, np.nan)
+    return replace(restoration.filtered, sharpness=sharpness)
+
+
 def test_every_doubt_is_named_once_with_a_remedy(restoration):
     done, reading, removed = restoration.deconvolution, restoration.guard_readings[-1], restoration.deconvolution.sigma
     none, frames = replace(done, sigma=0.0), restoration.frame_count
@@ -56,7 +62,7 @@ def test_every_doubt_is_named_once_with_a_remedy(restoration):
         CheckKind.CONTRADICTION: {"is_mean": True, "structure": StructureReading(0.3, 0.6, 0.0)},
         CheckKind.MOTION: {"structure": StructureReading(0.0, 0.6, 0.0)},
         CheckKind.REPETITION: {"mean": coarse.astype(np.float32)},
-        CheckKind.FEW_FRAMES: {"frame_count": 7},
+        CheckKind.FEW_FRAMES: {"filtered": only(restoration, 7)},
         CheckKind.GEOMETRY: {"dynamics": replace(restoration.dynamics, R=1600.0)},
         CheckKind.AGREEMENT: {"disagreement": np.ones_like(restoration.disagreement)},
         CheckKind.UNSEEN: {"unseen": 0.04},
@@ -75,15 +81,15 @@ def test_every_doubt_is_named_once_with_a_remedy(restoration):
     assert f"{frames} frames" in restoration.verdict.gained
 
 
-def test_a_remedy_names_the_width_that_was_measured(restoration):
-    changed = replace(
-        restoration,
-        deconvolution=replace(restoration.deconvolution, sigma=0.0),
-        posterior=widths(restoration, 0.61, 0.93, 1.2),
-    )
+@pytest.mark.parametrize(
+    ("sigma", "text"), [(0.0, "no blur is removed, although 0.70 "), (0.2, "0.20 of 0.70 pixels of blur are removed")]
+)
+def test_a_remedy_names_the_width_that_the_guards_took_back(restoration, sigma, text):
+    posterior = replace(widths(restoration, 0.61, 0.93, 1.2), removed=0.7)
+    changed = replace(restoration, deconvolution=replace(restoration.deconvolution, sigma=sigma), posterior=posterior)
     (check,) = changed.verdict.checks
-    assert check.text == "no blur is removed, although 0.93 pixels were measured (0.61 to 1.20)"
-    assert check.remedy.startswith("--sigma 0.93 ")
+    assert check.text.startswith(text) and "0.93" not in str(check)
+    assert check.remedy.startswith("--sigma 0.70 ")
 
 
 def test_a_blur_whose_removal_would_not_be_seen_is_no_doubt(restoration):
@@ -100,6 +106,14 @@ def test_a_shift_of_the_whole_frame_is_no_doubt_about_the_geometry(restoration):
     assert moved.verdict.checks == ()
     bent = replace(restoration, dynamics=dynamics)
     assert [check.kind for check in bent.verdict.checks] == [CheckKind.GEOMETRY]
+
+
+def test_only_the_frames_that_are_kept_tell_the_geometry(restoration):
+    (few,) = replace(restoration, filtered=only(restoration, 7)).verdict.checks
+    assert few.text.startswith("7 frames ")
+    bent = replace(restoration, filtered=only(restoration, 12), dynamics=replace(restoration.dynamics, R=1600.0))
+    (geometry,) = bent.verdict.checks
+    assert geometry.kind is CheckKind.GEOMETRY and " 12 frames tell " in geometry.text
 
 
 def test_objects_that_were_replaced_are_part_of_what_was_gained(restoration):

@@ -85,7 +85,7 @@ class Restoration:
         frames.  Moving objects are not in it.
     centroid : Centroid
     dynamics : FlowDynamics or None
-        Where frames are processed in tiles it is for the record: the filter has a model of each tile.
+        Where frames are processed in tiles it is for information only: each tile has its own model.
     filtered : Filtered or None
         Recentred: its image is at the mean geometry of all frames; the centroid and its flows are at that of the
         training frames.
@@ -238,11 +238,13 @@ def _checks(restoration: Restoration, motion: float) -> Iterator[Check]:
     period, largest = repetition(restoration.mean), _LARGEST * of_air * motion / math.sqrt(2)
     if period < 2 * largest:
         yield write_check(CheckKind.REPETITION, period, largest)
-    error = of_air * mean_flow_error(restoration.dynamics, int(np.isfinite(filtered.sharpness).sum()))
-    if restoration.frame_count < FEW:
-        yield write_check(CheckKind.FEW_FRAMES, counted(restoration.frame_count, "frame"), error, FEW)
+    # Frames that were not kept make neither the image nor its geometry.
+    kept = int(np.isfinite(filtered.sharpness).sum())
+    error = of_air * mean_flow_error(restoration.dynamics, kept)
+    if kept < FEW:
+        yield write_check(CheckKind.FEW_FRAMES, counted(kept, "frame"), error, FEW)
     elif error > _SEEN_BEND:
-        yield write_check(CheckKind.GEOMETRY, error, counted(restoration.frame_count, "frame"))
+        yield write_check(CheckKind.GEOMETRY, error, counted(kept, "frame"))
     if structure is not None and structure.left > _HALF:
         yield write_check(CheckKind.MOTION, structure.left)
     if (disputed := _disputed(restoration)) > _HALF:
@@ -263,10 +265,9 @@ def _checks_of_blur(restoration: Restoration) -> Iterator[Check]:
         yield write_check(CheckKind.BLUR_UNKNOWN)
         return
     # Nothing is wrong where removing a blur would not be seen to help: such clips are bad no more often than others.
-    if removed < _HALF * restoration.posterior.removed:
-        kind = CheckKind.BLUR_LEFT if removed > 0 else CheckKind.NO_BLUR_REMOVED
-        low, width, high = map(float, restoration.posterior.width)
-        yield write_check(kind, width, low, high, removed)
+    decided = float(restoration.posterior.removed)
+    if removed < _HALF * decided:
+        yield write_check(CheckKind.BLUR_LEFT if removed > 0 else CheckKind.NO_BLUR_REMOVED, decided, removed)
 
 
 def _share_of_air(flows: FloatArray) -> float:

@@ -33,7 +33,7 @@ _CHECKS = {
     CheckKind.INPUT: ("{0}", "ignore this if it is what you expect"),
     CheckKind.WATERMARK: (
         "a half-transparent mark lies over the scene and is restored poorly",
-        "--roi X,Y,WIDTH,HEIGHT leaves it out; --static-mask FILE fills what it names, where the camera moves",
+        "leave it out with --roi X,Y,WIDTH,HEIGHT; where the camera moves, --static-mask FILE fills what it names",
     ),
     CheckKind.TWO_STATES: ("a part of the scene switches between two states, and the image may mix them", "{0}"),
     CheckKind.SATURATED: ("{0}", "expose shorter; ignore this where what is white has no detail"),
@@ -68,11 +68,11 @@ _CHECKS = {
     ),
     CheckKind.UNSEEN: ("{0} of the image is seen in hardly any frame", "--border crop"),
     CheckKind.NO_BLUR_REMOVED: (
-        "no blur is removed, although {0:.2f} pixels were measured ({1:.2f} to {2:.2f})",
+        "no blur is removed, although {0:.2f} pixels were to be: the guards against ringing and noise forbid it",
         "--sigma {0:.2f} removes it; ignore this if edges ring then",
     ),
     CheckKind.BLUR_LEFT: (
-        "{3:.2f} pixels of blur are removed, although {0:.2f} were measured ({1:.2f} to {2:.2f})",
+        "{1:.2f} of {0:.2f} pixels of blur are removed: the guards against ringing and noise forbid more",
         "--sigma {0:.2f} removes all; ignore this if edges ring then",
     ),
     CheckKind.BLUR_UNKNOWN: (
@@ -111,7 +111,7 @@ def explain_training(train: int, frame_count: int, wanted: int | None) -> Decisi
     elif train == half:
         reason = "half of the clip"
     elif train > half:
-        reason = "more than half of a short clip"
+        reason = "the motion of a short clip is learnt from more than half of it"
     else:
         reason = "half of the clip exceeds the default limit, or the memory"
     return Decision("training", f"first {train} of {frame_count} frames", reason)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import html
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar, TypeVarTuple
@@ -13,15 +14,25 @@ from nicegui import ui
 from ..folders import printable
 from ..job import one_line
 
-# What the page calls the options that errors name; longer ones first.
+# What the page calls the options that errors, decisions and verdicts name; longer ones first.
 _LABELS = {
     "allow overwriting": "tick Replace existing files",
+    "leave out --sigma": "press As measured",
+    "--roi X,Y,WIDTH,HEIGHT of": "under Region, choose",
+    "--roi X,Y,WIDTH,HEIGHT": "Region",
+    "--frames FIRST:END with": "under Frames, choose",
+    "--static-mask FILE": "the option static-mask of the command line",
+    "--border crop": "Border of the image: crop what few frames show",
     "--reference": "Reference for the geometry",
     "--keep-best": "Keep best",
     "--overwrite": "Replace existing files",
     "--bit-depth": "Depth",
+    "--axes thwc": "the option axes of the command line",
+    "--axes thw": "the option axes of the command line",
     "--derotate": "Turn a planet back",
+    "--hdr keep": "the option hdr of the command line",
     "--frames": "Frames",
+    "--bayer": "Bayer pattern of a raw clip",
     "--sigma": "Width",
     "--scale": "Grid of the result",
     "--roi": "Region",
@@ -72,7 +83,9 @@ class Notices:
 
 
 def labelled(message: str) -> str:
-    """Name the fields of the page in place of the options that an error names."""
+    """Name the fields of the page in place of the options that a message names."""
+    # The page names the last frame, and the option the one behind it.
+    message = re.sub(r"--frames (\d+):(\d+)", lambda ends: f"Frames {ends[1]} to {int(ends[2]) - 1}", message)
     for option, label in _LABELS.items():
         message = message.replace(option, label)
     return message

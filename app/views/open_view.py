@@ -14,7 +14,7 @@ from turbrestore.io.video import VIDEO_SUFFIXES
 
 from ..folders import Entry, printable
 from ..tab import Tab
-from .elements import Notices
+from .elements import Notices, labelled
 
 _NAMES = {"train": "training frames", "frames_per_second": "frames a second"}
 # Facts that are shown only where there is something to say.
@@ -72,7 +72,7 @@ class OpenView:
             f"<dt>{html.escape(name.replace('_', ' ').capitalize())}</dt><dd>{html.escape(_text(value))}</dd>"
             for name, value in ((_NAMES.get(name, name), value) for name, value in rows)
         )
-        remarks = "".join(f'<p class="remark">{html.escape(remark)}</p>' for remark in clip.remarks)
+        remarks = "".join(f'<p class="remark">{html.escape(labelled(remark))}</p>' for remark in clip.remarks)
         summary = html.escape(_summary(clip.facts))
         more = f'<details class="more"><summary>More about this clip</summary><dl class="facts">{facts}</dl></details>'
         self._facts.content = f'<p class="sum">{summary}</p>{remarks}{more}'

@@ -113,6 +113,8 @@ class Page:
         self.save_view.opened()
         self.tune_view.opened()
         self.steady_view.opened()
+        if self.tab.ordered_video is not None:
+            self.steady_view.take_over(self.tab.ordered_video)
         self.several_view.opened()
         self.look_at("clip")
         self._refresh()

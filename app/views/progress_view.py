@@ -11,6 +11,7 @@ from turbrestore.core.remarks import counted
 from turbrestore_cli.progress import TITLES
 
 from ..tab import Tab
+from .elements import labelled
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -73,8 +74,7 @@ class ProgressView:
         self._show_bars(job.bars.copy())
         self._show_decisions(job)
         self._stop.visible = state == "running"
-        done = f"Finished in {job.seconds:.1f} s. {job.message}"
-        self._state.text = done if state == "done" else _STATES[state]
+        self._state.text = _finished(job, job.message) if state == "done" else _STATES[state]
         self._state.visible = True
         self._stages.visible = state != "done"
         self._ended = state != "running"
@@ -85,7 +85,7 @@ class ProgressView:
         job = self._job
         if job is not None and self._ended and job.state == "done" and job.message:
             told = "The verdict follows when what was tuned is applied." if pending else job.message
-            self._state.text = f"Finished in {job.seconds:.1f} s. {told}"
+            self._state.text = _finished(job, told)
 
     def _show_nothing(self) -> None:
         self._clear()
@@ -114,8 +114,8 @@ class ProgressView:
     def _show_decisions(self, job: Job[object]) -> None:
         decisions = tuple(job.decisions)
         lines = (
-            f"<dt>{html.escape(decision.subject)}: {html.escape(decision.choice)}</dt>"
-            f"<dd>{html.escape(decision.reason)}</dd>"
+            f"<dt>{html.escape(decision.subject)}: {html.escape(labelled(decision.choice))}</dt>"
+            f"<dd>{html.escape(labelled(decision.reason))}</dd>"
             for decision in decisions
         )
         shown = "" if job.state == "done" else " open"
@@ -126,3 +126,8 @@ class ProgressView:
         self._decided.visible = bool(decisions)
         if self._decided.content != content:
             self._decided.content = content
+
+
+def _finished(job: Job[object], told: str) -> str:
+    """Say how long a run took, and what is to be told of it."""
+    return f"Finished in {job.seconds:.1f} s. {labelled(told)}"

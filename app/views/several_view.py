@@ -14,7 +14,7 @@ from ..job import Job
 from ..restoring import Order
 from ..several import inputs_of, plan_several
 from ..tab import Tab
-from .elements import Notices
+from .elements import Notices, labelled
 from .progress_view import ProgressView
 
 
@@ -73,7 +73,7 @@ class SeveralView:
         """Show what becomes of the clips; return the run when it has just ended."""
         rows = "".join(
             f'<tr class="{row.state}"><th scope="row">{html.escape(printable(row.name))}</th>'
-            f"<td>{row.state}{html.escape(printable(f': {row.words}' if row.words else ''))}</td></tr>"
+            f"<td>{row.state}{html.escape(printable(f': {labelled(row.words)}' if row.words else ''))}</td></tr>"
             for row in tuple(self._tab.rows)
         )
         if rows != self._drawn:

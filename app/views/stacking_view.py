@@ -130,7 +130,7 @@ class StackingView:
                 ui.label(words).classes("what")
             suggested = () if found.suggested is None else (found.suggested,)
             for one in (*found.kept, *suggested):
-                percent = max(1, round(100 * one.share))
+                percent = one.percent
                 button = ui.button(f"{percent} %", on_click=partial(self._keep.set_value, percent))
                 button.props("outline dense no-wrap")
                 if one is found.suggested:

@@ -57,19 +57,32 @@ class SteadyView:
             self._command.build("Command of the video")
 
     def opened(self) -> None:
-        """Suggest a name for the video of a new clip."""
+        """Start from what is usual, and suggest a name for the video of a new clip."""
         clip = self._tab.clip
         assert clip is not None
-        self._path.value = printable(f"{clip.name.stem}.steady.mp4")
+        self._fill(Path(f"{clip.name.stem}.steady.mp4"), SteadyParams(), Output(), overwrite=False)
         self._command.show("")
 
+    def take_over(self, order: SteadyOrder) -> None:
+        """Fill the fields by what a run had, and show its command."""
+        clip, output = self._tab.clip, self._tab.folders.shown(order.output)
+        assert clip is not None
+        self._fill(output, order.params, order.written, order.overwrite)
+        self._command.show(order.command_line(clip.name, output))
+
+    def _fill(self, output: Path, params: SteadyParams, written: Output, overwrite: bool) -> None:
+        self._path.value = printable(output)
+        self._camera.value, self._sigma.value = params.camera, params.sigma
+        self._largest.value, self._reach.value = params.largest, params.reach
+        self._codec.value, self._crf.value = written.codec, written.crf
+        self._overwrite.value = overwrite
+
     def _build_options(self) -> None:
-        usual = SteadyParams()
         with ui.element("div").classes("fields pair"):
             self._sigma = ui.number("Blur to remove, pixels", min=0, max=20, step=0.1, placeholder="estimated")
             self._largest = ui.number("Largest shift, pixels", min=0.1, step=0.5, placeholder="measured")
         with ui.element("div").classes("fields pair"):
-            self._reach = ui.number("Reach, frames", min=1, max=60, step=1, value=usual.reach, format="%d")
+            self._reach = ui.number("Reach, frames", min=1, max=60, step=1, format="%d")
             self._crf = ui.number("Quality, 0 best to 51", min=0, max=51, step=1, placeholder="14", format="%d")
         with ui.element("div").classes("fields"):
             self._codec = ui.select(_CODECS, label="Codec", value=None)

@@ -14,12 +14,15 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
+from turbrestore.core.decision import Decision
 from turbrestore.core.errors import ConfigurationError, DataError, OutputError
+from turbrestore.core.verdict import CheckKind
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.footage.levels import Levels
 from turbrestore.io.video import write_video
 from turbrestore.registration.centroid import CentroidParams
 from turbrestore.settings import RestoreParams
+from turbrestore.wording import write_check
 from turbrestore_app import folders, job, restoring, stage_memory, tuning
 from turbrestore_app.clip import open_clip
 from turbrestore_app.folders import Folders
@@ -28,10 +31,12 @@ from turbrestore_app.job import Bar, Job, one_line
 from turbrestore_app.pictures import Pictures
 from turbrestore_app.restoring import Order, preview_order, restore_order
 from turbrestore_app.saving import Outputs, check_outputs, command_line, save
-from turbrestore_app.several import inputs_of, plan_several
+from turbrestore_app.several import Row, inputs_of, plan_several
 from turbrestore_app.tab import Tab
 from turbrestore_app.tuning import impressions, part_around, tuned_params
 from turbrestore_app.views.elements import labelled
+from turbrestore_app.views.progress_view import ProgressView
+from turbrestore_app.views.several_view import SeveralView
 from turbrestore_cli.__main__ import main
 from turbrestore_cli.options import Selection
 
@@ -272,6 +277,31 @@ def test_errors_name_the_fields_of_the_page():
     )
     assert labelled("--frames: expected start:stop, found '1'") == "Frames: expected start:stop, found '1'"
     assert labelled("--roi: expected 4 numbers") == "Region: expected 4 numbers"
+    # The page counts the last frame in.
+    assert labelled("--frames 0:9 shows one, --frames 9:20 the other") == (
+        "Frames 0 to 8 shows one, Frames 9 to 19 the other"
+    )
+
+
+@pytest.mark.parametrize("kind", CheckKind)
+def test_remedies_name_the_fields_of_the_page(kind):
+    assert "--" not in labelled(write_check(kind, 1.0, 1.0, 1.0).remedy)
+
+
+def test_what_a_run_tells_names_the_fields_of_the_page():
+    told = f"Verdict: 8 frames; check: {write_check(CheckKind.UNSEEN, '4 %')}."
+    decision = Decision("two states", "", "--frames 0:9 shows one", CheckKind.TWO_STATES)
+    job = SimpleNamespace(kind="restore", state="done", bars={}, decisions=[decision], seconds=1.0, message=told)
+    tab = SimpleNamespace(job=job, busy=False, rows=[Row("a.mkv", "done", told)])
+    progress, several = ProgressView(tab, "restore"), SeveralView(tab, None, None)
+    progress._starters = ()
+    progress._stages = SimpleNamespace(clear=lambda: None)
+    progress._stop, progress._state, progress._decided, several._rows = (SimpleNamespace(content="") for _ in range(4))
+    several._progress = progress
+    several.follow()
+    assert progress._state.text.endswith("(Border of the image: crop what few frames show).")
+    assert "Frames 0 to 8 shows one" in progress._decided.content
+    assert "Border of the image: crop" in several._rows.content
 
 
 class TestSeveral:

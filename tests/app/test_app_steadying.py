@@ -12,6 +12,7 @@ from turbrestore.core.errors import ConfigurationError, OutputError
 from turbrestore.io.video import open_frames
 from turbrestore.steady.settings import SteadyParams
 from turbrestore_app.folders import Folders
+from turbrestore_app.restoring import Order
 from turbrestore_app.steadying import SteadyOrder
 from turbrestore_app.tab import Tab
 from turbrestore_cli.__main__ import main
@@ -71,6 +72,7 @@ class TestSteady:
         for suffix in (".mp4", ".mp4.toml"):
             assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
         # A page may still play the film of the video before.
+        assert (tab.ordered_video, tab.ordered) == (order, Order(order.path, order.selection))
         films = [tab.steadied.film_path]
         for _ in range(2):
             assert ended(tab.steady(replace(order, overwrite=True))).state == "done"
@@ -81,8 +83,10 @@ class TestSteady:
             order.check()
         with pytest.raises(ConfigurationError, match=r"ends in \.mp4"):
             replace(order, output=tmp_path / "a.mkv").check()
+        tab.open(folder / "clip.mkv")
+        assert (tab.ordered_video, tab.ordered) == (None, None)
         tab.close()
-        assert not tab.steadied.film_path.exists()
+        assert not any(film.exists() for film in films)
 
     def test_a_stop_leaves_nothing(self, folder, tmp_path, held):
         tab = Tab(Folders(folder))
@@ -91,6 +95,13 @@ class TestSteady:
         held.set()
         assert ended(job).state == "stopped"
         assert (tab.steadied, list(tmp_path.iterdir())) == (None, [])
+        tab.close()
+
+    def test_doubts_about_the_clip_are_in_the_verdict(self, tmp_path):
+        np.save(tmp_path / "a.npy", np.random.default_rng(0).uniform(0, 1, (48, 64, 5)).astype(np.float32))
+        tab = Tab(Folders(tmp_path))
+        job = ended(tab.steady(SteadyOrder(tmp_path / "a.npy", tmp_path / "a.mp4")))
+        assert "; check: its axes are taken for " in job.message
         tab.close()
 
     def test_options_are_those_of_the_command(self, folder, tmp_path):

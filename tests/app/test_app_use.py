@@ -245,6 +245,8 @@ def test_a_page_that_is_loaded_again_goes_on(open_tab, app):
 
 
 def test_several_clips_and_a_steadied_video(open_tab, app):
+    from playwright.sync_api import expect
+
     page = open_tab((900, 860))
     press(page, "Restore them")
     page.get_by_role("alert").get_by_text("choose some in the list").wait_for()
@@ -277,6 +279,8 @@ def test_several_clips_and_a_steadied_video(open_tab, app):
         assert page.evaluate(grey, "input") != page.evaluate(grey, "output")
         page.reload()
         page.wait_for_function(f"({playing}) === 128", timeout=LONG)
+        expect(page.get_by_label("Command of the video")).to_have_text(command)
+        expect(page.get_by_label("Reach, frames")).to_have_value("6")
         rows.nth(1).wait_for()
         assert rows.count() == 2
         press(page, "Clip")
@@ -287,6 +291,9 @@ def test_several_clips_and_a_steadied_video(open_tab, app):
         shutil.rmtree(app.folder / "restored")
         for path in app.folder.glob("small.steady.*"):
             path.unlink()
+    open_another(page, "chart.mkv", 48)
+    expect(page.get_by_label("Command of the video")).to_be_hidden()
+    expect(page.get_by_label("Reach, frames")).to_have_value("12")
 
 
 def test_a_run_is_stopped_and_another_tab_goes_on(open_tab, app):

@@ -156,3 +156,5 @@ def test_weights_and_quantiles_are_in_order():
     decision = explain_posterior(found, 0.5)
     assert decision.choice == "0.50 pixels removed"
     assert f"{found.width[1]:.2f} pixels ({found.width[0]:.2f} to {found.width[2]:.2f})" in decision.reason
+    wider = explain_posterior(replace(found, by_variation=found.width + 3), 0.5)
+    assert wider.reason.endswith("; the variation of the frames alone would give more")

@@ -123,6 +123,7 @@ class TestJournal:
 
     def test_page_escapes_what_it_is_told(self):
         page = render_batch([ClipRow("<i>.mkv", "out/<i>#.png", "done"), ClipRow("b", "b.png")], "<b>")
+        assert "looks right" in page and "looks right" not in render_batch([ClipRow("a", "a.png", "done", checks="b")])
         assert "<i>" not in page and "<b>" not in page and "%3Ci%3E%23.png" in page and "not done yet" in page
 
 
@@ -136,6 +137,8 @@ class TestBatch:
         table = rows(tmp_path / "out")
         assert [row["state"] for row in table] == ["done", "failed", "done"]
         assert table[1]["reason"].startswith("cannot be opened as a video") and table[1]["frames"] == ""
+        verdicts = [row["checks"] or "looks right" for row in json.loads(out)["clips"]]
+        assert [row["checks"] for row in table] == [verdicts[0], "", verdicts[2]]
         assert [row["frames"] for row in table[::2]] == ["8", "8"]
         assert [row["state"] for row in json.loads(out)["clips"]] == ["done", "failed", "done"]
         page = (tmp_path / "out" / "index.html").read_text()
@@ -256,6 +259,7 @@ class TestBatch:
         assert [line.split(":")[1] for line in told[1:4]] == [f" {number} of 3" for number in (1, 2, 3)]
         assert [row["state"] for row in rows(tmp_path / "out")] == ["failed", "done", "done"]
         assert not (tmp_path / "out" / "index.html").exists()
+        assert told[4].startswith(f"turbrestore: {tmp_path / 'out' / 'index.html'}: not written; pip install ")
         assert main(["batch", *words, "--workers", "2"]) == 2
         assert "pip install 'distributed" in capsys.readouterr().err
 

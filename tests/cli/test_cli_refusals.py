@@ -42,7 +42,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, make, code, par
     ("word", "told"),
     [
         ("http://host//a.mkv", "http://host//a.mkv: no such file or folder; addresses are not opened"),
-        ("-", "-: no such file or folder; steady alone reads and writes standard streams"),
+        ("-", "-: expected the name of a file; steady alone reads and writes standard streams"),
         ("night/*.ser", "night/*.ser: no such file or folder; batch takes patterns"),
         ("./frame%03d.png", "./frame%03d.png: no such file or folder; a series of images is read by the name of its"),
         ("-/-a.mkv", "-/-a.mkv: taken for an option; write ./-/-a.mkv, or --"),
@@ -127,6 +127,19 @@ def test_errors_name_options_as_they_were_typed(run, clip, tmp_path):
         ("restore", clip): "OUTPUT: expected a value, found none; turbrestore restore --help",
         ("sharp", clip): "sharp: no such command; turbrestore --help",
         ("restor", clip): 'Did you mean "restore"?',
+        ("steady", clip, "o.mkv", "--derotat", "jupiter"): "Did you mean --derotate?",
+        ("steady", "-", "o.mkv", "--roi", "0,0,9,9"): "leave out the options that select or repair frames\n",
     }.items():
         fails(run(*words), 73 if words[2:] == (taken,) else 2, expected)
     assert not new.exists()
+
+
+def test_a_hyphen_for_an_image_lists_no_suffixes(run, tmp_path):
+    _, _, told = run("deconvolve", "-", tmp_path / "o.png")
+    assert told == "turbrestore: -: expected the name of a file; steady alone reads and writes standard streams\n"
+
+
+@pytest.mark.parametrize("option", ["--rotat", "--rotate", "--layers", "--port"])
+def test_options_that_mean_something_else_are_not_suggested(run, clip, option):
+    _, _, told = run("steady", clip, "o.mp4", option)
+    assert told == f"turbrestore: Unknown option: {option}.\n"

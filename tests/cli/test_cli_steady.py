@@ -46,6 +46,18 @@ def test_bits_that_the_output_does_not_hold_are_named(run, tmp_path):
         assert code == 0 and err.count("h264 holds 8 of the 10 bits of the input") == told
 
 
+def test_doubts_about_the_input_are_in_the_verdict(run, tmp_path):
+    columns = np.random.default_rng(0).uniform(0, 1, (48, 64, 5)).astype(np.float32)
+    np.save(tmp_path / "a.npy", columns)
+    page = tmp_path / "report.html"
+    code, out, _ = run("steady", tmp_path / "a.npy", tmp_path / "b.npy", "--sigma", "0", "--json", "--report", page)
+    checks = json.loads(out)["verdict"]["checks"]
+    assert code == 0 and checks[0]["kind"] == "input"
+    doubt = checks[0]["text"]
+    assert doubt.startswith("its axes are taken for ")
+    assert page.read_text().count(doubt) == 1
+
+
 def test_settings_repeat_the_run(run, tmp_path):
     first, second = tmp_path / "a.npy", tmp_path / "b.npy"
     assert run("steady", SAMPLE, first, *PART, "--camera", "lock", "--sigma", "1.1", "--bit-depth", "32")[0] == 0

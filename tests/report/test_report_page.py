@@ -116,6 +116,24 @@ class TestPage:
         assert (fact.value, fact.note, fact.doubtful) == ("0.00 px", "cannot be measured", True)
         assert "could not be estimated" in [fact.note for fact in facts.headline(unknown)]
 
+    @pytest.mark.parametrize(
+        ("sigma", "removed", "limited", "reason"),
+        [
+            (0.9, 0.9, False, ""),
+            (0.0, 0.0, False, "; removing more would not be seen to help"),
+            (0.3, 0.3, False, "; removing more would not be seen to help"),
+            (0.3, 0.3, True, "; the edges of the image are too steep for more"),
+            (0.3, 0.9, False, "; the guards against ringing and noise forbid more"),
+        ],
+    )
+    def test_the_headline_says_why_less_blur_is_removed_than_measured(self, whole, sigma, removed, limited, reason):
+        width = np.array([0.61, 0.93, 1.2])
+        posterior = dataclasses.replace(whole.posterior, width=width, removed=removed, edge_limited=limited)
+        done = dataclasses.replace(whole.deconvolution, sigma=sigma)
+        changed = dataclasses.replace(whole, posterior=posterior, deconvolution=done)
+        (fact,) = (fact for fact in facts.headline(changed) if fact.name == "Blur removed")
+        assert fact.note == f"measured 0.93 (0.61 to 1.20){reason}"
+
     def test_doubts_stand_at_the_top(self, whole, run):
         sure = render_report(dataclasses.replace(whole, guard_readings=()), run)
         doubt, remark = "cut short after 6 whole frames; the others are missing", "1 duplicated: frame 3 left out"

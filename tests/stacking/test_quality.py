@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from conftest import natural_scene
+from turbrestore.footage.frame_selection import best_frames
 from turbrestore.io.video import write_video
-from turbrestore.stacking.quality import quality_list, quality_table
+from turbrestore.stacking.quality import KeptShare, quality_list, quality_table
 
 
 def frames(blurs, noise, size=96):
@@ -47,6 +48,15 @@ def test_the_suggested_share_rises_with_noise_and_is_worth_most():
         # The table does not contradict what it suggests, and fewer frames would draw a check of their own.
         assert found.suggested.worth >= max(1.05, *(one.worth for one in found.kept if one.frames >= 8))
         assert found.suggested.frames >= 8
+
+
+@pytest.mark.parametrize(
+    ("frames", "of", "percent"),
+    [(104, 1000, 11), (1, 1000, 1), (4, 33, 12), (55, 100, 55), (8, 30, 27), (300, 300, 100)],
+)
+def test_whole_percent_keep_no_fewer_frames(frames, of, percent):
+    assert KeptShare(frames / of, frames, 1.0, 1.0, 1.0).percent == percent
+    assert best_frames(np.arange(of), percent / 100).sum() >= frames
 
 
 def test_no_share_is_suggested_where_all_frames_are_as_good():

@@ -97,8 +97,8 @@ def keep_agreed(
     clear, share = float((share >= _CLEAR).mean()), np.maximum(share, flat)
     if clear < _REMARKED:
         return Guarded(image, share, ())
-    choice = f"detail in {100 * clear:.0f} % of the image is that of the mean of the registered frames"
-    reason = "there the halves of the clip do not agree on it: noise, water, clouds, rain or registration that failed"
+    choice = f"in {100 * clear:.0f} % of the image, the mean of the registered frames is kept without sharpening"
+    reason = "the halves of the clip disagree there: noise, water, clouds, rain or registration that failed"
     return Guarded(image, share, (Decision("agreement", choice, reason),))
 
 

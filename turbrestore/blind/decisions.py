@@ -48,9 +48,9 @@ def explain_posterior(posterior: BlurPosterior, removed: float) -> Decision:
         reason = f"the edges of the image are too steep for more; {reason}"
     elif posterior.removed == 0:
         reason = f"removing one would not be seen to improve it; {reason}"
-    outside = [name for name, found in witnesses.items() if found[0] > high or found[2] < low]
-    if outside:
-        reason += f"; outside the measured range: {' and '.join(outside)}"
+    for name, found in witnesses.items():
+        if found[0] > high or found[2] < low:
+            reason += f"; {name} alone would give {'more' if found[0] > high else 'less'}"
     return Decision("blur", choice, reason)
 
 

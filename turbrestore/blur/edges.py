@@ -87,7 +87,7 @@ def find_edges(image: FloatArray, noise: float) -> Edges:
 def fewer_edges(edges: Edges, most: int) -> Edges:
     """Leave out rows of tiles until about as few edges remain as wanted."""
     every = -(-len(edges.places) // most)
-    # Of the rows that have edges, since those that are kept must not be empty.
+    # Only rows with edges are numbered, so that no row that is kept is empty.
     _, rows = np.unique(edges.places[:, 0] // _TILE, return_inverse=True)
     kept = rows.ravel() % max(every, 1) == 0
     return Edges(edges.places[kept], edges.normals[kept])

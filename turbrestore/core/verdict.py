@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+# The verdict where nothing is doubtful.
+RIGHT = "looks right"
+
 
 class CheckKind(StrEnum):
     """What is doubtful about a result.
@@ -82,4 +85,4 @@ class Verdict:
     checks: tuple[Check, ...] = ()
 
     def __str__(self) -> str:
-        return f"{self.gained}; " + (f"check: {'; '.join(map(str, self.checks))}" if self.checks else "looks right")
+        return f"{self.gained}; " + (f"check: {'; '.join(map(str, self.checks))}" if self.checks else RIGHT)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..blur.posterior import BlurPosterior
 from ..core.remarks import counted
 from ..registration.coverage import SEEN, coverage
 from ..results import Restoration
@@ -230,12 +231,24 @@ def _blur_note(restoration: Restoration) -> str:
     blur = restoration.blur
     if restoration.posterior is not None:
         low, width, high = restoration.posterior.width
-        return f"measured {width:.2f} ({low:.2f} to {high:.2f})"
+        return f"measured {width:.2f} ({low:.2f} to {high:.2f}){_why_less(restoration, restoration.posterior)}"
     if blur is None:
         return "as requested"
     if not math.isfinite(blur.uncertainty):
         return "could not be estimated"
     return f"estimated {blur.sigma:.2f} ± {blur.uncertainty:.2f}"
+
+
+def _why_less(restoration: Restoration, posterior: BlurPosterior) -> str:
+    """Say why less blur is removed than the range that was measured; empty where it is not less."""
+    done = restoration.deconvolution
+    if done is None or done.sigma >= posterior.width[0]:
+        return ""
+    if done.sigma < posterior.removed:
+        return "; the guards against ringing and noise forbid more"
+    if posterior.edge_limited:
+        return "; the edges of the image are too steep for more"
+    return "; removing more would not be seen to help"
 
 
 def _as_written(value: Any) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import ROUNDING, FloatArray, luminance
-from ..core.remarks import counted
+from ..core.remarks import Doubt, counted
 from ..core.verdict import CheckKind, Verdict
 from ..display.curves import plot_over_frames
 from ..io.output import atomic_write
@@ -52,6 +52,7 @@ class SteadyFigures:
     scenes: int = 0
     sigma: float = 0.0  # width of the blur that was removed, pixels
     seconds: float = 0.0  # time of the run
+    remarks: tuple[str, ...] = ()  # on the input
 
     def note(self, frame: SteadyFrame) -> None:
         """Take note of the next frame."""
@@ -69,8 +70,11 @@ class SteadyFigures:
             removed.append(f"{self.sigma:.2f} pixels of blur")
         count, moves = counted(len(self.moving), "frame"), share_words(float(np.mean(self.moving)))
         gained = f"{count} with {' and '.join(removed)} removed; {moves} of the image moves"
+        checks = [write_check(CheckKind.INPUT, remark) for remark in self.remarks if isinstance(remark, Doubt)]
         astray = float(np.mean(self.let_go))
-        return Verdict(gained, (write_check(CheckKind.DRIFT, share_words(astray)),) if astray >= _ASTRAY else ())
+        if astray >= _ASTRAY:
+            checks.append(write_check(CheckKind.DRIFT, share_words(astray)))
+        return Verdict(gained, tuple(checks))
 
 
 def write_steady_report(

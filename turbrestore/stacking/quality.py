@@ -16,6 +16,7 @@ that the air has spared are worth more than the rest only where noise is low.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -47,6 +48,14 @@ class KeptShare:
     noise: float  # of their mean over that of the mean of all frames
     sharpness: float  # fine detail of their mean over that of all frames, if both are registered
     worth: float  # by how much more detail exceeds noise and error than with all frames, as a ratio
+
+    @property
+    def percent(self) -> int:
+        """The share in whole percent: the nearest that keeps no fewer frames."""
+        nearest = round(100 * self.share)
+        # A share of a frame counts as a frame.
+        keeps = math.ceil(round(nearest / 100 * self.frames / self.share, 9))
+        return nearest if keeps >= self.frames else nearest + 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,9 +108,9 @@ def quality_table(found: QualityList, numbers: Iterable[int]) -> str:
     """Write the list for a terminal: what shares cost and gain, and the best and the worst frames."""
     names = list(numbers)
     lines = ["share kept   frames   noise   sharpness   worth"]
-    rows = [(f"{one.share:.0%}", one) for one in found.kept]
+    rows = [(f"{one.percent}%", one) for one in found.kept]
     if found.suggested is not None:
-        rows.append((f"{found.suggested.share:.0%} *", found.suggested))
+        rows.append((f"{found.suggested.percent}% *", found.suggested))
     lines += [
         f"{name:<10} {one.frames:>8} {one.noise:>6.2f}× {one.sharpness:>10.2f}× {one.worth:>6.2f}×"
         for name, one in rows

@@ -88,7 +88,7 @@ class Memory:
     pose: Matrix  # (3, 3): E
     mean: FloatArray  # (H, W): B
     distances: FloatArray  # (H, W, 2): e_Z and e_F, squared intensity
-    let_go: float  # share of the memory that its distance from B has let go at the last frame
+    let_go: float  # share of the image that the last frame replaced because it differed from B
 
 
 def remember(

@@ -68,8 +68,8 @@ class SteadyFrame:
     starts_scene : bool
         Whether a new scene starts here.
     let_go : float
-        Share of the memory of the scene that was let go here, or of the estimate that the frame replaces, because the
-        frames lay nearer to their own mean or were sharper (:mod:`turbrestore.steady.fusion`).
+        Share of the accumulated image, or of the estimate, that this frame replaced, because the frames lay nearer to
+        their own mean or were sharper (:mod:`turbrestore.steady.fusion`).
     """
 
     number: int
@@ -216,7 +216,7 @@ class _Scenes:
         self._steadied = np.eye(3)
 
     def remove(self, sigma: float, said: WindowWitnesses | None) -> None:
-        """Set the width of the blur of frames, and what is known of that of what is remembered if it may be another."""
+        """Set the blur width of frames; the witnesses ``said`` allow another for the accumulated image."""
         self._said, self._first, self._width = said, sigma, sigma
 
     def keep_title(self, window: Window) -> None:
