@@ -129,7 +129,7 @@ def test_different_shapes_and_bad_bounds_are_refused():
 
 def test_edges_in_one_row_of_tiles_are_not_all_left_out(monkeypatch):
     # More edges than are followed, all of them in the second row of tiles.
-    monkeypatch.setattr("turbrestore.blind.guards._SAMPLES", 40 * 13)
+    monkeypatch.setattr("turbrestore.blur.edges._SAMPLES", 40 * 13)
     edge = np.repeat([0.2] * 24 + [0.8] * 24, 48).reshape(48, 48).astype(np.float32)
     blurred = cv2.GaussianBlur(edge, (0, 0), 1.5)
     assert ringing(edge + 2 * (edge - blurred), blurred, 1.5) == 1.0

@@ -43,13 +43,12 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..blur.edges import edge_profiles, fewer_edges, find_edges, largest_fall
+from ..blur.edges import REACH_SIGMAS, TILE, edge_profiles, edge_reach, find_some_edges, largest_fall, rising_edges
 from ..core.arrays import ROUNDING, FloatArray, check_image, luminance
 from ..core.errors import DataError, require_between
 from ..core.noise import estimate_noise
 from ..runtime.scratch import iter_parts
 
-_WINDOW_SIGMAS = 4.0
 _SMALLEST_WINDOW = 8
 _BEYOND = 0.3
 # A range below this share of the contrast of the whole image is taken for noise.
@@ -64,20 +63,14 @@ _LEAST_DEVIATION = 1e-4
 _SLIGHT = 1.5
 # Widest blur whose ringing is judged, pixels: behind a wider one, profiles of four widths cross the next letter.
 WIDEST_RINGS = 3.0
-# Distance up to which edges are followed at least, pixels.
-_SMALLEST_REACH = 6
 # Distance within which the step of an edge ends, in widths of the blur and in pixels.
 _STEP_SIGMAS, _SMALLEST_STEP = 2.5, 3
-# Steps count from this multiple of the noise, and from this share of the steps of most edges.
-_STEP, _STRONG, _MOST = 12.0, 0.3, 90
-# Share of the step, and multiple of the noise, by which q may fall.
-_EVEN, _EVEN_NOISE = 0.03, 2.0
-# Side of a tile, pixels; fewest sides of edges in it; share of its largest step from which an edge counts.
-_TILE, _FEWEST, _ALIKE = 16, 5, 0.6
+# Share of the steps of most edges from which one counts.
+_STRONG = 0.3
+# Fewest sides of edges in a tile; share of its largest step from which an edge counts.
+_FEWEST, _ALIKE = 5, 0.6
 # Share of the step from which an overshoot is a ring.
 _RING = 0.12
-# Most samples of all profiles.
-_SAMPLES = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -165,7 +158,7 @@ def _planes(image: FloatArray) -> Iterator[FloatArray]:
 
 
 def _overshoot(after: FloatArray, before: FloatArray, sigma: float) -> float:
-    radius = max(_SMALLEST_WINDOW, round(_WINDOW_SIGMAS * sigma))
+    radius = max(_SMALLEST_WINDOW, round(REACH_SIGMAS * sigma))
     window = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     high, low = cv2.dilate(before, window), cv2.erode(before, window)
     contrast = float(np.subtract(*np.percentile(before, (99, 1))))
@@ -196,20 +189,19 @@ def _noise_gain(after: FloatArray, before: FloatArray) -> float:
 
 def ringing(after: FloatArray, before: FloatArray, sigma: float) -> float:
     """Return the share of strong edges along which a deconvolved image (H, W) rings."""
-    reach = max(_SMALLEST_REACH, int(np.ceil(_WINDOW_SIGMAS * sigma)))
+    reach = edge_reach(sigma)
     noise = estimate_noise(before)
-    edges = fewer_edges(find_edges(before, noise), _SAMPLES // (2 * reach + 1))
+    edges = find_some_edges(before, noise, reach)
     if not len(edges.places):
         return 0.0
     of_before, of_after = (edge_profiles(image, edges, reach) for image in (before, after))
     within = max(_SMALLEST_STEP, int(np.ceil(_STEP_SIGMAS * sigma)))
     steps = sum(side[:, : within + 1].max(axis=1) for side in of_before)
-    strong = steps > max(_STRONG * float(np.percentile(steps, _MOST)), _STEP * noise)
     falls: list[NDArray[Any]] = []
     counts: list[NDArray[Any]] = []
     for q, p, limit in zip(of_before, of_after, (1, 0), strict=True):
-        rises = largest_fall(q) < np.maximum(_EVEN * steps, _EVEN_NOISE * noise)
-        chosen = strong & rises & (limit - q.max(axis=1) > _RING * steps)
+        _, rising = rising_edges(steps, largest_fall(q), noise, _STRONG)
+        chosen = rising & (limit - q.max(axis=1) > _RING * steps)
         fall, count = _falls_by_tile(q[chosen], p[chosen], steps[chosen], edges.places[chosen])
         falls.append(fall)
         counts.append(count)
@@ -221,7 +213,7 @@ def _falls_by_tile(
     q: FloatArray, p: FloatArray, steps: FloatArray, places: FloatArray
 ) -> tuple[NDArray[Any], NDArray[np.int_]]:
     """Fall of the mean p less that of the mean q, relative to the step, and number of edges, of every tile."""
-    _, tiles = np.unique(places // _TILE, axis=0, return_inverse=True)
+    _, tiles = np.unique(places // TILE, axis=0, return_inverse=True)
     largest = np.zeros(len(places), np.float32)
     np.maximum.at(largest, tiles.ravel(), steps)
     alike = steps >= _ALIKE * largest[tiles.ravel()]

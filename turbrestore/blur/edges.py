@@ -34,10 +34,10 @@ _GRADIENT, _SAMPLES, _ROWS = 4.0, 1 << 18, 64
 # Standard deviation of the Gaussian under which gradients are measured, and rows that its filters reach.
 _SMOOTH, _AROUND = 0.7, 6
 # Distance up to which edges rise, and A: widths of the blur, and pixels.
-_REACH_SIGMAS, _SMALLEST_REACH = 4.0, 6
+REACH_SIGMAS, _SMALLEST_REACH = 4.0, 6
 _RISE_SIGMAS, _SMALLEST_RISE = 1.75, 2
-# Steps count from this multiple of the noise, and from this share of the steps of most edges.
-_STEP, _STRONG, _MOST = 12.0, 0.6, 90
+# Steps count from this multiple of the noise, and from a share of the steps of most edges, here this one.
+_STEP, _MOST, _STRONG = 12.0, 90, 0.6
 # Share of the step, and multiple of the noise, by which a rising profile may fall.
 _EVEN, _EVEN_NOISE = 0.03, 2.0
 # Fewest edges that rise, their least share of all strong edges, and the share of them that bounds a width.
@@ -52,7 +52,7 @@ _RATIO = 1.05
 # Photographs are as soft as this, pixels; below it nothing is safe to remove.  Width and uncertainty of a sharp image.
 _SOFT, _SHARP, _PIXEL_UNCERTAINTY = 0.8, 0.35, 0.1
 # Side of a tile, pixels.
-_TILE = 16
+TILE = 16
 # Frequencies over which M is integrated, cycles per pixel.
 _FREQUENCIES = np.linspace(0, 4, 1001)
 
@@ -84,11 +84,21 @@ def find_edges(image: FloatArray, noise: float) -> Edges:
     return Edges(np.concatenate(places), np.concatenate(normals))
 
 
-def fewer_edges(edges: Edges, most: int) -> Edges:
+def edge_reach(sigma: float) -> int:
+    """Distance, pixels, up to which the edges behind a blur of this width rise."""
+    return max(_SMALLEST_REACH, int(np.ceil(REACH_SIGMAS * sigma)))
+
+
+def find_some_edges(image: FloatArray, noise: float, reach: int) -> Edges:
+    """Find edges of an image (H, W), no more than memory allows for the profiles."""
+    return _fewer_edges(find_edges(image, noise), _SAMPLES // (2 * reach + 1))
+
+
+def _fewer_edges(edges: Edges, most: int) -> Edges:
     """Leave out rows of tiles until about as few edges remain as wanted."""
     every = -(-len(edges.places) // most)
     # Only rows with edges are numbered, so that no row that is kept is empty.
-    _, rows = np.unique(edges.places[:, 0] // _TILE, return_inverse=True)
+    _, rows = np.unique(edges.places[:, 0] // TILE, return_inverse=True)
     kept = rows.ravel() % max(every, 1) == 0
     return Edges(edges.places[kept], edges.normals[kept])
 
@@ -113,6 +123,14 @@ def largest_fall(profiles: NDArray[Any]) -> NDArray[Any]:
     return (np.maximum.accumulate(profiles, axis=1) - profiles).max(axis=1)
 
 
+def rising_edges(
+    steps: NDArray[Any], falls: NDArray[Any], noise: float, share: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which edges (n,) have strong steps, from this share of those of most edges, and which of them rise."""
+    strong = steps > max(share * float(np.percentile(steps, _MOST)), _STEP * noise)
+    return strong, strong & (falls < np.maximum(_EVEN * steps, _EVEN_NOISE * noise))
+
+
 def edge_limit(image: FloatArray, sigma: float, exponent: float) -> tuple[float, float] | None:
     """Width and uncertainty that the edges of an image (H, W) allow; None where they do not rule out the given width.
 
@@ -130,20 +148,19 @@ def edge_limit(image: FloatArray, sigma: float, exponent: float) -> tuple[float,
 def _widest_blur(image: FloatArray, exponent: float, widest: float) -> float:
     """Smallest width for which a quarter of the rising edges are too steep, at most ``widest``."""
     noise = estimate_noise(image)
-    farthest = max(_SMALLEST_REACH, int(np.ceil(_REACH_SIGMAS * widest)))
-    edges = fewer_edges(find_edges(image, noise), _SAMPLES // (2 * farthest + 1))
+    farthest = edge_reach(widest)
+    edges = find_some_edges(image, noise, farthest)
     if len(edges.places) < _FEWEST:
         return widest
     profiles = edge_profiles(image, edges, farthest)
     darkest = _background(image, noise)
     for sigma in np.exp(np.arange(np.log(_SHARP), np.log(widest), np.log(_RATIO))):
-        reach = max(_SMALLEST_REACH, int(np.ceil(_REACH_SIGMAS * sigma)))
+        reach = edge_reach(sigma)
         rise = max(_SMALLEST_RISE, int(np.ceil(_RISE_SIGMAS * sigma)))
         bright, dark = (side[:, : reach + 1] for side in profiles)
         steps = bright[:, : rise + 1].max(axis=1) + dark[:, : rise + 1].max(axis=1)
         falls = np.maximum(largest_fall(bright), largest_fall(dark))
-        strong = steps > max(_STRONG * float(np.percentile(steps, _MOST)), _STEP * noise)
-        rising = strong & (falls < np.maximum(_EVEN * steps, _EVEN_NOISE * noise))
+        strong, rising = rising_edges(steps, falls, noise, _STRONG)
         if rising.sum() < _RISING * strong.sum():
             rising &= -dark[:, -1] < darkest
         if rising.sum() < max(_FEWEST, _LIMB * strong.sum()):
