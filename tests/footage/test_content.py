@@ -210,7 +210,7 @@ class TestStuckPixels:
 
     def test_the_end_of_a_letter_is_kept_and_a_pixel_beside_an_edge_is_not(self):
         def found():
-            detector = StuckPixelDetector(0.05)
+            detector = StuckPixelDetector()
             for frame in stack:
                 detector.update(frame)
             return detector.found().tolist()

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray
 from ...core.decision import Decision
-from ...core.errors import ConfigurationError, DataError, require_between
+from ...core.errors import ConfigurationError, DataError
 from ...core.remarks import Doubt, counted
 from ...io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
 from ...io.source import FrameSource, numbers_text
@@ -41,40 +41,21 @@ from .repeats import RepeatDetector
 from .scene_cuts import MOST_SCENES, Scene, SceneDetector, group_scenes, thumbnail, turned_back
 from .stuck_pixels import StuckPixelDetector, repair_stuck
 
+# Blank frames have at most this contrast or share of the median contrast; share of saturated pixels that is named.
 _LEAST_CONTRAST, _BLANK_CONTRAST, _SATURATED = 1 / 510, 0.1, 0.5
 
 
 @dataclass(frozen=True)
 class ContentParams:
-    """Thresholds for defects of the content, and whether they are errors.
+    """What is done about defects of the content.
 
     Parameters
     ----------
     strict : bool
         Raise DataError instead of repairing defects or leaving frames out.
-    blank_contrast : float
-        Frames of at most this share of the median contrast are blank.
-    cut_similarity : float
-        Similarity, 0 to 1, below which two frames show different scenes.
-    stuck_excess : float
-        Distance, as a share of full scale, by which a stuck pixel lies outside the range of its neighbours.
-
-    Examples
-    --------
-    >>> ContentParams(cut_similarity=2)
-    Traceback (most recent call last):
-    ...
-    turbrestore.core.errors.ConfigurationError: cut_similarity: expected 0 to 1, found 2
     """
 
     strict: bool = False
-    blank_contrast: float = _BLANK_CONTRAST
-    cut_similarity: float = 0.5
-    stuck_excess: float = 0.05
-
-    def __post_init__(self) -> None:
-        for name in ("blank_contrast", "cut_similarity", "stuck_excess"):
-            require_between(name, getattr(self, name), 0, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +131,7 @@ def check_content(source: FrameSource, params: ContentParams | None = None) -> C
     ((5,), [[8, 9]])
     """
     params = params or ContentParams()
-    scan = _ContentScan(source, params)
+    scan = _ContentScan(source)
     for number, pixels, mosaic in zip(source.numbers, source.native(), source.mosaics(), strict=True):
         scan.update(number, pixels, mosaic)
     report = scan.report()
@@ -205,7 +186,7 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
 def without_blank(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
     """Leave out frames that show nothing; a source without any is returned as it is."""
     contrasts = np.array([thumbnail(frame).std() for frame in source], np.float64)
-    blank = np.asarray(source.numbers)[_are_blank(contrasts, _BLANK_CONTRAST)].tolist()
+    blank = np.asarray(source.numbers)[_are_blank(contrasts)].tolist()
     choice, reason = f"{numbers_text(blank)} left out", f"at most {_BLANK_CONTRAST:.0%} of the usual contrast"
     found = Decision("blank frames", choice, reason)
     return (source.without(blank, f"{choice}: {reason}"), (found,)) if blank else (source, ())
@@ -225,8 +206,8 @@ def keep_all(report: ContentReport) -> ContentReport:
 class _ContentScan:
     """State of the pass over the frames."""
 
-    def __init__(self, source: FrameSource, params: ContentParams) -> None:
-        self._source, self._params = source, params
+    def __init__(self, source: FrameSource) -> None:
+        self._source = source
         self._previous: PixelArray | None = None
         self._contrasts = array("d")
         self._usual = 0.0
@@ -237,8 +218,8 @@ class _ContentScan:
         self._repeats = RepeatDetector()
         self._needs_backdrop = False
         self._borders = BlackBorderDetector()
-        self._stuck = StuckPixelDetector(params.stuck_excess)
-        self._scenes = SceneDetector(params.cut_similarity)
+        self._stuck = StuckPixelDetector()
+        self._scenes = SceneDetector()
         # The same for a clip with black borders, whose thumbnails are compared without them, from the first one on.
         self._bordered_scenes: SceneDetector | None = None
         self._shown: FloatArray | None = None
@@ -263,7 +244,7 @@ class _ContentScan:
         self._contrasts.append(contrast := float(thumb.std()))
         # A running estimate of the median, because blank frames must reach neither the scenes nor the stuck pixels.
         self._usual += 0.1 * (max(contrast, _LEAST_CONTRAST) - self._usual) if self._usual else contrast
-        if contrast > max(_LEAST_CONTRAST, self._params.blank_contrast * self._usual):
+        if contrast > max(_LEAST_CONTRAST, _BLANK_CONTRAST * self._usual):
             # Stuck pixels are isolated in the mosaic; interpolation of colours spreads them.
             self._stuck.update(values if mosaic is None else self._planes(mosaic))
             self._scenes.update(thumb)
@@ -277,7 +258,7 @@ class _ContentScan:
     def report(self) -> ContentReport:
         numbers = np.asarray(self._source.numbers)
         contrasts = np.frombuffer(self._contrasts)
-        blank = _are_blank(contrasts, self._params.blank_contrast)
+        blank = _are_blank(contrasts)
         duplicated = np.isin(numbers, self._duplicated) | self._repeats.found()
         borders = self._borders.found()
         detector = (borders and self._bordered_scenes) or self._scenes
@@ -394,7 +375,7 @@ def _how_filled(report: ContentReport) -> str:
     return f"{others}, and {share}" if report.filled_values > unseen.sum() * len(report.numbers) else share
 
 
-def _are_blank(contrasts: NDArray[np.float64], share: float) -> NDArray[np.bool_]:
+def _are_blank(contrasts: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Tell which frames are blank by their contrasts; none where all would be."""
-    blank = contrasts <= share * np.median(contrasts)
+    blank = contrasts <= _BLANK_CONTRAST * np.median(contrasts)
     return np.asarray(blank & ~blank.all())

@@ -19,6 +19,8 @@ from ...io.pixels import PixelArray
 
 _MOST_STUCK = 0.005
 _FEWEST_FRAMES = 10
+# Distance, as a share of full scale, by which a stuck pixel lies outside the range of its neighbours.
+_EXCESS = 0.05
 # Most frames in which all pixels are compared; afterwards only the remaining candidates are followed.
 _DENSE_FRAMES = 8
 # A lone pixel exceeds its highest neighbour by this share of its distance from the median of all neighbours.
@@ -34,8 +36,7 @@ _AROUND = np.argwhere(NEIGHBOURS) - 1
 class StuckPixelDetector:
     """Finds pixels that lie outside the range of all their neighbours in every frame."""
 
-    def __init__(self, excess: float) -> None:
-        self._excess = excess
+    def __init__(self) -> None:
         self._frames = 0
         self._high: NDArray[np.bool_] | None = None
         self._low: NDArray[np.bool_] | None = None
@@ -70,9 +71,9 @@ class StuckPixelDetector:
 
     def _compare_all(self, values: FloatArray) -> None:
         around = cv2.dilate(values, NEIGHBOURS)
-        high = np.subtract(values, around, out=around) > self._excess
+        high = np.subtract(values, around, out=around) > _EXCESS
         around = cv2.erode(values, NEIGHBOURS, dst=around)
-        low = np.subtract(around, values, out=around) > self._excess
+        low = np.subtract(around, values, out=around) > _EXCESS
         self._high = high if self._high is None else self._high & high
         self._low = low if self._low is None else self._low & low
         count = np.count_nonzero(self._high) + np.count_nonzero(self._low)
@@ -95,9 +96,9 @@ class StuckPixelDetector:
         own, around = _with_neighbours(values, self._places)
         sign = self._sign[:, None]
         over = (sign * (own[:, None] - around)).min(axis=1)
-        keep = over > self._excess
+        keep = over > _EXCESS
         middle = np.median(around, axis=1, keepdims=True)
-        height = np.maximum(np.abs(own[:, None] - middle), self._excess)
+        height = np.maximum(np.abs(own[:, None] - middle), _EXCESS)
         self._alone = np.minimum(self._alone, over / height[:, 0])[keep]
         self._shared = np.minimum(self._shared, sign * (around - middle) / height)[keep]
         self._places, self._sign = self._places[keep], self._sign[keep]
