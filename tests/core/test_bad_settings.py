@@ -37,13 +37,7 @@ WRONG = {
         "ridge": [-0.1],
     },
     FilterParams: {
-        **{
-            "residual": ["half"],
-            "inner_iterations": [0],
-            "block": [0],
-            "sharpness": [-1.0],
-            "sharpness_window": [0.0, NAN],
-        },
+        **{"residual": ["half"], "inner_iterations": [0], "block": [0], "sharpness": [-1.0, NAN]},
         **{"image_noise": [0.0, 1e300], "image_drift": [-1.0], "prior_frames": [-1.0]},
     },
     DeconvolutionParams: {

@@ -3,7 +3,13 @@ import numpy as np
 import pytest
 
 from turbrestore.core.noise_spectrum import RINGS, NoiseSpectrum
-from turbrestore.filtering.frame_noise import frame_noise_variance, invalid_mask, local_sharpness, project_gradient
+from turbrestore.filtering.frame_noise import (
+    SHARPNESS_WINDOW,
+    frame_noise_variance,
+    invalid_mask,
+    local_sharpness,
+    project_gradient,
+)
 from turbrestore.filtering.frame_statistics import _coloured, measure_frame_statistics
 from turbrestore.registration.warp import inside
 
@@ -51,7 +57,7 @@ def test_the_noise_is_that_of_its_definition(model_and_frames):
     product = sum(a * b for a, b in zip(gradient(frame), gradient(scene), strict=True))
     energy = sum(a**2 for a in gradient(scene))
     assert sharp == pytest.approx(product.sum() / energy.sum(), rel=1e-3)
-    score = np.clip(model.score_scale * (smooth(product, model.window) - model.mean_sharpness), -3, 3)
+    score = np.clip(model.score_scale * (smooth(product, SHARPNESS_WINDOW) - model.mean_sharpness), -3, 3)
     excess = smooth(np.square(frame - model.mean_frame), 3.0) / model.deviation / 6
     difference = frame - model.median
     small = smooth(np.square(difference - smooth(difference, 5.0)), 0.8) / model.spread / 8
@@ -96,7 +102,7 @@ def test_what_holds_for_all_frames_is_their_mean_and_variance(model_and_frames):
     model, scene, frames = model_and_frames
     stack, slopes = np.array(frames, np.float64), gradient(scene)
     products = [sum(a * b for a, b in zip(gradient(frame), slopes, strict=True)) for frame in frames]
-    seen = np.array([smooth(product, model.window) for product in products])
+    seen = np.array([smooth(product, SHARPNESS_WINDOW) for product in products])
     assert model.image_noise == pytest.approx(stack.var(axis=0, ddof=1).mean(), rel=1e-4)
     # Nothing deviates from the rest.
     assert model.mean_frame == pytest.approx(stack.mean(axis=0), abs=1e-5)
@@ -151,7 +157,7 @@ def test_the_score_hardly_knows_the_noise_of_its_own_pixel(model_and_frames):
     for _ in range(20):
         noise = rng.normal(0, 1, SHAPE).astype(np.float32)
         projection = project_gradient(noise, model.template)
-        scores = [local_sharpness(projection, 3.0, left_out) for left_out in (0.0, 0.25)]
+        scores = [local_sharpness(projection, left_out) for left_out in (0.0, 0.25)]
         shifts += [-float((noise * score * laplacian)[INSIDE].sum()) for score in scores]
     assert 0 < shifts[1] < 0.4 * shifts[0]
 

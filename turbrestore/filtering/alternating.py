@@ -271,7 +271,6 @@ def _measure_settings(
         [frame for frame, _ in pairs],
         [flow for _, flow in pairs],
         image,
-        params.sharpness_window,
         params.image_noise,
         runtime.threads,
     )

@@ -47,8 +47,6 @@ class FilterParams:
     sharpness : float, optional
         β: how strongly locally sharp frames are preferred; 0 gives every frame the same scalar gain.  By default
         chosen on the first block, at most 2: it falls with the noise.
-    sharpness_window : float
-        Standard deviation of the window in which sharpness is measured, pixels.
     image_noise : float, optional
         Z₀: variance of a registered frame about the image, squared intensity; by default measured on the first block.
     image_drift : float
@@ -62,7 +60,6 @@ class FilterParams:
     inner_iterations: int = 2
     block: int = 24
     sharpness: float | None = None
-    sharpness_window: float = 3.0
     image_noise: float | None = None
     image_drift: float = 0.0
     prior_frames: float = 0.0
@@ -74,7 +71,6 @@ class FilterParams:
         require_between("block", self.block, 1, 10_000, "frames")
         if self.sharpness is not None:
             require_between("sharpness", self.sharpness, 0, 10)
-        require_between("sharpness_window", self.sharpness_window, 0.3, 100, "pixels")
         if self.image_noise is not None:
             require_between("image_noise", self.image_noise, 1e-12, 1)
         require_between("image_drift", self.image_drift, 0, 1)

@@ -49,6 +49,8 @@ _AROUND_FOLD, _FOLD_FADE = 3, 2.0
 # A frame that deviates from the usual by more than this many variances does not show the scene; the deviation is
 # averaged in a Gaussian window of this standard deviation, pixels.
 OUTLIER, OUTLIER_WINDOW = 6.0, 3.0
+# Standard deviation of the Gaussian window in which sharpness is measured, pixels.
+SHARPNESS_WINDOW = 3.0
 # The same for what is as small as a flake, against the median of the frames, without what is wider than that.
 _DISAGREES, AGREEMENT_WINDOW, _FINE_WINDOW, LEVEL_WINDOW = 8.0, 1.5, 0.8, 5.0
 # Sobel's derivative divided by 8 is the first along one axis and the second along the other.
@@ -68,7 +70,6 @@ class FrameStatistics:
     mean_sharpness: Stack
     score_scale: Stack  # (H, W): factor from a deviation of the local sharpness to z; 0 where an object has moved
     score_variance: Stack  # (H, W): v, variance of z over the frames
-    window: float  # standard deviation of the Gaussian window in which sharpness is measured, pixels
     left_out: float  # κ, 0 to 1/4
     sharpness_weight: float  # β for which the noise that the weights add is worth the sharpness that they gain
     mean_frame: Stack  # (H, W): mean luminance of the registered frames without outliers
@@ -136,7 +137,7 @@ def frame_noise_variance(
     disagreement = smooth(difference * difference, _FINE_WINDOW) / (statistics.spread * _DISAGREES)
     excess = xp.clip(xp.maximum(excess, disagreement), 1, None)
     squared = excess * excess
-    local = local_sharpness(projection, statistics.window, statistics.left_out)
+    local = local_sharpness(projection, statistics.left_out)
     score = (local - statistics.mean_sharpness) * statistics.score_scale
     score = xp.clip(score, -_LARGEST_SCORE, _LARGEST_SCORE)
     # z / e² where z > 0: something other than the scene may have more contrast than the scene.
@@ -180,17 +181,17 @@ def project_gradient(grey: Stack, template: Stack) -> Stack:
     return dx * template[0] + dy * template[1]
 
 
-def local_sharpness(projection: Stack, window: float, left_out: float) -> Stack:
+def local_sharpness(projection: Stack, left_out: float) -> Stack:
     """Average of the projected gradient (H, W) in a Gaussian window, of whose middle a share is left out.
 
     The noise n of a pixel is part of the score of the window around it. By Stein's lemma the weights ``exp(β z)``
     therefore shift the fused pixel by ``β cov(n, z)``, whatever the number of frames. The shift is proportional to the
     Laplacian of the template: noise is added that looks like sharpness, and a blind estimate of the blur believes it.
     """
-    whole = smooth(projection, window)
+    whole = smooth(projection, SHARPNESS_WINDOW)
     if left_out == 0:
         return whole
-    return (whole - smooth(projection, window / 2) * left_out) / (1 - left_out)
+    return (whole - smooth(projection, SHARPNESS_WINDOW / 2) * left_out) / (1 - left_out)
 
 
 def gradient(image: Stack) -> tuple[Stack, Stack]:

@@ -32,6 +32,7 @@ from .frame_noise import (
     LEVEL_WINDOW,
     OUTLIER,
     OUTLIER_WINDOW,
+    SHARPNESS_WINDOW,
     FrameStatistics,
     gradient,
     project_gradient,
@@ -73,7 +74,6 @@ def measure_frame_statistics(
     frames: Sequence[FloatArray],
     flows: Sequence[FloatArray],
     image: FloatArray,
-    window: float = 3.0,
     image_noise: float | None = None,
     threads: int = 0,
 ) -> FrameStatistics:
@@ -98,17 +98,17 @@ def measure_frame_statistics(
     mean, variance, covered = _robust_start(mean, variance, centre, usual)
 
     square = template[0] ** 2 + template[1] ** 2
-    energy = smooth(square, window)
+    energy = smooth(square, SHARPNESS_WINDOW)
     sensor_noise = fit_noise_curve(mean, np.where(covered, variance, fine), energy).variance(mean)
-    mean_frame, deviation, moments = _without_outliers(frames, flows, mean, variance, template, window, threads)
+    mean_frame, deviation, moments = _without_outliers(frames, flows, mean, variance, template, threads)
     noise = noise_of_frames(frames, flows, mean_frame)
     coloured = _coloured(template, noise)
-    sharpness, spread, explained, left_out = _leave_middle_out(moments, coloured, sensor_noise, window)
+    sharpness, spread, explained, left_out = _leave_middle_out(moments, coloured, sensor_noise)
     # Where a scene without noise is flat, the square of the scale exceeds single precision.
     scale = _score_scale(sharpness, spread, explained)
     weight = _sharpness_weight(sharpness, spread - explained, scale**2 * spread, float(sensor_noise.mean()) / count)
     # Near a moving object the flow follows it, and a frame may be sharp without showing the scene.
-    scale *= 1 - smooth(covered.astype(np.float32), window)
+    scale *= 1 - smooth(covered.astype(np.float32), SHARPNESS_WINDOW)
     return FrameStatistics(
         frame_noise=noise.deviation,
         image_noise=max(float(variance.mean()) if image_noise is None else image_noise, _IMAGE_NOISE_FLOOR),
@@ -117,7 +117,6 @@ def measure_frame_statistics(
         mean_sharpness=sharpness.astype(np.float32),
         score_scale=scale.astype(np.float32),
         score_variance=(scale**2 * spread).astype(np.float32),
-        window=window,
         left_out=left_out,
         sharpness_weight=weight,
         mean_frame=mean_frame,
@@ -200,7 +199,6 @@ def _without_outliers(
     mean: np.ndarray,
     variance: np.ndarray,
     template: FloatArray,
-    window: float,
     threads: int,
 ) -> tuple[FloatArray, FloatArray, _SharpnessMoments]:
     """Mean and variance of the registered frames, and of their sharpness, without pixels that deviate from all others.
@@ -218,7 +216,7 @@ def _without_outliers(
             cv2.accumulate(registered, total, kept)
             cv2.accumulateSquare(registered - centre, squares, kept)
             projection = project_gradient(registered, template)
-            whole, middle = (smooth(projection, width) * kept for width in (window, window / 2))
+            whole, middle = (smooth(projection, width) * kept for width in (SHARPNESS_WINDOW, SHARPNESS_WINDOW / 2))
             _add_moments(whole, *moments[:2])
             _add_moments(middle, *moments[2:4])
             cv2.accumulateProduct(whole, middle, moments[4])
@@ -254,13 +252,14 @@ def _coloured(template: FloatArray, noise: NoiseSpectrum) -> FloatArray:
 
 
 def _leave_middle_out(
-    moments: _SharpnessMoments, template: FloatArray, noise: FloatArray, window: float
+    moments: _SharpnessMoments, template: FloatArray, noise: FloatArray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Mean and variance of the local sharpness, the part of the variance that noise explains, and κ.
 
     κ grows with that part: without noise the middle of the window is where the sharpness of a pixel shows best.  Noise
     n of variance ``noise`` adds ``Σ g t · ∇n = −Σ n ∇·(g t)`` to the sharpness, with t the template, g the window.
     """
+    window = SHARPNESS_WINDOW
     energy = smooth(template[0] ** 2 + template[1] ** 2, window)
     divergence = smooth((gradient(template[0])[0] + gradient(template[1])[1]) ** 2, window / np.sqrt(2))
     # ∫ g² and, along one axis, ∫ (∇g)² of a Gaussian of deviation s are 1 / (4π s²) and 1 / (8π s⁴).
