@@ -59,8 +59,9 @@ _CLIPPED, _LEAST_SHARE = 0.05, 0.01
 # Standard deviation of the Gaussian that separates fine detail, pixels.
 _DETAIL_WINDOW = 4.0
 _LEAST_DEVIATION = 1e-4
-# Slight excess over a bound, as a factor.
-_SLIGHT = 1.5
+# Factor on the width of the blur after a failed attempt; its square root after the first if no bound is exceeded by
+# more than a slight factor.
+BACK_OFF, _SLIGHT = 0.85, 1.5
 # Widest blur whose ringing is judged, pixels: behind a wider one, profiles of four widths cross the next letter.
 WIDEST_RINGS = 3.0
 # Distance within which the step of an edge ends, in widths of the blur and in pixels.
@@ -75,7 +76,7 @@ _RING = 0.12
 
 @dataclass(frozen=True)
 class GuardParams:
-    """Bounds that a deconvolved image must keep, and what is done if it does not.
+    """Bounds that a deconvolved image must keep.
 
     Parameters
     ----------
@@ -85,25 +86,16 @@ class GuardParams:
         Largest share of pixels beyond the local range of the blurred image by 30 % of that range.
     noise_gain : float
         Largest ratio, after to before, of the standard deviation in the flattest fifth of the image.
-    back_off : float
-        Factor on the width of the blur after a failed attempt; its square root after the first if no bound is exceeded
-        by more than a half.
-    tries : int
-        Largest number of attempts; if the last one fails, no blur is removed.
     """
 
     ringing: float = 0.15
     overshoot: float = 0.12
     noise_gain: float = 6.0
-    back_off: float = 0.85
-    tries: int = 10
 
     def __post_init__(self) -> None:
         require_between("ringing", self.ringing, 0, 1)
         require_between("overshoot", self.overshoot, 0, 1)
         require_between("noise_gain", self.noise_gain, 1, 1000)
-        require_between("back_off", self.back_off, 0.1, 0.99)
-        require_between("tries", self.tries, 1, 100)
 
     def first_back_off(self, reading: GuardReading) -> float:
         """Return the factor on the width after the first attempt, if that failed."""
@@ -112,7 +104,7 @@ class GuardParams:
             reading.overshoot / max(self.overshoot, ROUNDING),
             reading.noise_gain / self.noise_gain,
         )
-        return self.back_off**0.5 if excess <= _SLIGHT else self.back_off
+        return BACK_OFF**0.5 if excess <= _SLIGHT else BACK_OFF
 
 
 @dataclass(frozen=True)

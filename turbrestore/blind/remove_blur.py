@@ -29,7 +29,7 @@ from ..runtime.scratch import to_scratch
 from ..runtime.steps import finish
 from ..runtime.tiling import HALO, HaloTile, add_tile, halo_tiles, largest_tile, new_mosaic
 from .decisions import explain_blur, explain_guards, explain_posterior
-from .guards import GuardParams, GuardReading, evaluate_guards
+from .guards import BACK_OFF, GuardParams, GuardReading, evaluate_guards
 
 # Bytes per pixel, and per pixel and channel, of what is computed before and after the deconvolution; the guards take
 # most.
@@ -39,6 +39,8 @@ _RESULTS_BYTES = 8
 # The widest blur that is found, pixels, and the least shorter side of an image in widths of its blur: a wider one
 # leaves nothing to restore.
 WIDEST, SIGMAS_A_SIDE = 21.0, 8
+# Most attempts; if the last one fails, no blur is removed.
+_MOST_TRIES = 10
 # Shortest side that tiles may have, pixels.
 SMALLEST_SIDE = 4 * HALO
 # More threads than these take no more memory.
@@ -185,12 +187,12 @@ def guarded_steps(
 ) -> Steps[tuple[Deconvolution, tuple[GuardReading, ...]]]:
     """Deconvolve an image (H, W[, 3]) by smaller and smaller widths until the guards pass."""
     readings: list[GuardReading] = []
-    while sigma > 0 and len(readings) < guards.tries:
+    while sigma > 0 and len(readings) < _MOST_TRIES:
         result = yield from attempt(sigma)
         readings.append(evaluate_guards(result.image, blurred, sigma, guards))
         if readings[-1].passed:
             return result, tuple(readings)
-        sigma *= guards.back_off if len(readings) > 1 else guards.first_back_off(readings[0])
+        sigma *= BACK_OFF if len(readings) > 1 else guards.first_back_off(readings[0])
     result = yield from attempt(0.0)
     return result, tuple(readings)
 
