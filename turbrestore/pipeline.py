@@ -45,9 +45,12 @@ from .stacking.placement import settings_of_known_flows
 from .uncertainty.pixel_deviation import measure_deviation
 from .wording import (
     explain_border,
+    explain_camera,
+    explain_centroid,
     explain_dynamics,
-    explain_filter,
-    explain_registration,
+    explain_frames,
+    explain_geometry,
+    explain_motion,
     explain_seeing,
 )
 
@@ -156,7 +159,7 @@ def _fuse(run: Run) -> tuple[Restoration, Evidence]:
     training, saturation = read_training(run, stream)
 
     centroid = run.stage("centroid", "centroid", partial(centroid_stage, run, training))
-    run.decide(*explain_registration(centroid))
+    run.decide(explain_centroid(centroid), *explain_camera(centroid.flows), *explain_motion(centroid.flows))
     seeing = _measure_seeing(run, training, centroid)
 
     dynamics, filtered = None, None
@@ -172,7 +175,8 @@ def _fuse(run: Run) -> tuple[Restoration, Evidence]:
         mean = run.stage("filter", "mean", partial(finish_mean, unread, total, len(source)))
         # The sharpness is NaN for frames that do not count.
         chosen = int(np.isfinite(filtered.sharpness).sum())
-        run.decide(*explain_filter(filtered, dynamics, None if params.keep_best == 1 else chosen))
+        asked = None if params.keep_best == 1 else chosen
+        run.decide(explain_frames(filtered, asked), explain_geometry(filtered, dynamics))
     else:
         mean = mean_of(training)
 

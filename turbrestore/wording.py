@@ -125,11 +125,6 @@ def explain_input(saturated: float) -> tuple[Decision, ...]:
     return (Decision("saturation", "left as it is", reason, CheckKind.SATURATED),)
 
 
-def explain_registration(centroid: Centroid) -> tuple[Decision, ...]:
-    """Say how the centroid was found, and how camera and air move."""
-    return (explain_centroid(centroid), *explain_camera(centroid.flows), *explain_motion(centroid.flows))
-
-
 def explain_motion(flows: FloatArray) -> tuple[Decision, ...]:
     """Report motion, about the shift of the whole frame, that is too large for optical flow.
 
@@ -180,11 +175,6 @@ def explain_dynamics(dynamics: FlowDynamics, modelled: bool = False) -> tuple[De
         f"{largest:.3f}; frames are registered by {'the flow of the model' if modelled else 'the measured flow'}",
     )
     return modes, *(Decision("flow model", "adjusted", note) for note in dynamics.notes)
-
-
-def explain_filter(filtered: Filtered, dynamics: FlowDynamics, chosen: int | None) -> tuple[Decision, ...]:
-    """Say what the image is made of, and where it was moved."""
-    return explain_frames(filtered, chosen), explain_geometry(filtered, dynamics)
 
 
 def explain_frames(filtered: Filtered, chosen: int | None) -> Decision:
