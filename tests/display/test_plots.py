@@ -17,7 +17,7 @@ from turbrestore.blur.estimation import BlurEstimate, estimate_blur
 from turbrestore.core.decision import Decision
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
-from turbrestore.display.curves import plot_blur, plot_convergence, plot_filter, plot_frames, plot_objective
+from turbrestore.display.curves import plot_blur, plot_convergence, plot_frames, plot_objective, plot_over_frames
 from turbrestore.display.figure import ACCENT, INK, REST
 from turbrestore.display.maps import plot_displacements, plot_flow, plot_images
 from turbrestore.display.preview import encode_image, preview
@@ -128,7 +128,7 @@ class TestCurves:
 
     def test_long_runs_are_averaged_over_neighbours(self):
         gains = RNG.uniform(size=1801)
-        upper, lower = plot_filter(gains, np.ones(1801)).axes
+        upper, lower = plot_over_frames({"gains": gains, "ones": np.ones(1801)}).axes
         shown = curves(upper)[0]
         assert len(shown.get_xdata()) == 451
         assert shown.get_ydata()[1] == pytest.approx(gains[4:8].mean())
@@ -138,7 +138,7 @@ class TestCurves:
     def test_frames_that_do_not_count_are_gaps(self):
         sharpness = np.full(1201, np.nan)
         sharpness[:4] = [1, np.nan, 3, 5]
-        lower = plot_filter(np.ones(1201), sharpness).axes[1]
+        lower = plot_over_frames({"ones": np.ones(1201), "sharpness": sharpness}).axes[1]
         assert np.array_equal(curves(lower)[0].get_ydata()[:3], [2, 5, np.nan], equal_nan=True)
         assert np.isnan(curves(plot_frames([1, np.nan, 1], [0.5, 0, 0.5]).axes[0])[0].get_ydata()[1])
 

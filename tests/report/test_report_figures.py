@@ -7,7 +7,7 @@ import pytest
 
 from turbrestore.core.arrays import from_unit
 from turbrestore.core.noise_spectrum import RINGS, NoiseSpectrum
-from turbrestore.display.curves import plot_convergence, plot_filter
+from turbrestore.display.curves import plot_convergence, plot_over_frames
 from turbrestore.display.maps import plot_flow
 from turbrestore.display.spectra import plot_eigenvalues
 from turbrestore.report import facts, pictures
@@ -81,7 +81,7 @@ class TestPictures:
 def test_axes_of_all_figures_line_up():
     curves = [
         plot_convergence([0.8, 0.2], 0.1),
-        plot_filter([1.0, 0.5], [0.2, 1200.0]),
+        plot_over_frames({"gain": [1.0, 0.5], "innovation": [0.2, 1200.0]}),
         plot_eigenvalues(np.array([0.5 + 0.5j, 0.5 - 0.5j])),
     ]
     maps = [plot_flow(np.full((24, 32, 2), size)) for size in (1.0, 1e-3)]

@@ -40,14 +40,6 @@ def plot_convergence(mean_flow_sizes: ArrayLike, tolerance: float | None = None)
     return figure
 
 
-def plot_filter(gains: ArrayLike, innovations: ArrayLike) -> Figure:
-    """Show the gain of the image and the innovation of the flow, frame by frame.
-
-    ``gains`` (N,); ``innovations`` (N,).
-    """
-    return plot_over_frames({"Gain of the image": gains, "Innovation of the flow, pixels": innovations})
-
-
 def plot_frames(sharpness: ArrayLike, shares: ArrayLike) -> Figure:
     """Show how sharp each frame is, and how much weight it has.
 

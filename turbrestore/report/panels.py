@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..blur.posterior import BlurPosterior
-from ..display.curves import plot_blur, plot_convergence, plot_filter, plot_frames
+from ..display.curves import plot_blur, plot_convergence, plot_frames, plot_over_frames
 from ..display.maps import plot_disagreement, plot_displacements, plot_flow, plot_uncertainty
 from ..display.spectra import plot_eigenvalues, plot_signal, plot_singular_values
 from ..display.witnesses import plot_witnesses
@@ -112,7 +112,9 @@ def _dynamics(dynamics: FlowDynamics) -> Iterator[Panel]:
 
 
 def _filter(filtered: Filtered) -> Iterator[Panel]:
-    figure = plot_filter(filtered.gains, filtered.innovations)
+    figure = plot_over_frames(
+        {"Gain of the image": filtered.gains, "Innovation of the flow, pixels": filtered.innovations}
+    )
     caption = "How much each frame changed the image, and the motion that the model did not predict."
     yield make_panel(figure, "filter", "Gain and innovation of each frame", caption)
     figure = plot_frames(filtered.sharpness, filtered.shares)
