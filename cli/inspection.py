@@ -22,7 +22,7 @@ from turbrestore.io.video import open_frames
 from turbrestore.memory_plan import training_share
 from turbrestore.metrics import appearance, compare, compare_flows
 from turbrestore.runs.stage_files import load_flows
-from turbrestore.stacking.quality import quality_list, quality_table
+from turbrestore.stacking.quality import measure_quality, quality_table, sort_by_quality
 
 from .inputs import open_checked, read_input_image
 from .options import Flag, Selection, limits_of
@@ -69,7 +69,7 @@ def info(
     source, content = open_checked(input, selection)
     cleaned = clean_source(source, content)
     record: dict[str, object] = {"input": str(input), **describe_clip(cleaned, content)}
-    found = quality_list(cleaned) if quality else None
+    found = sort_by_quality(measure_quality(cleaned)) if quality else None
     if found is None or not json:
         _report(record, json)
     if found is not None and json:

@@ -9,13 +9,17 @@ import pytest
 from conftest import natural_scene
 from turbrestore.footage.frame_selection import best_frames
 from turbrestore.io.video import write_video
-from turbrestore.stacking.quality import KeptShare, quality_list, quality_table
+from turbrestore.stacking.quality import KeptShare, measure_quality, quality_table, sort_by_quality
 
 
 def frames(blurs, noise, size=96):
     scene, rng = natural_scene(size), np.random.default_rng(0)
     soft = [cv2.GaussianBlur(scene, (0, 0), blur) for blur in blurs]
     return [(image + rng.normal(0, noise, image.shape)).astype(np.float32) for image in soft]
+
+
+def quality_list(images):
+    return sort_by_quality(measure_quality(images))
 
 
 def test_frames_are_sorted_by_their_blur_and_noise_adds_no_quality():

@@ -72,11 +72,6 @@ class QualityList:
         return np.argsort(-self.quality, kind="stable")
 
 
-def quality_list(frames: Iterable[FloatArray]) -> QualityList:
-    """Sort the frames of a clip, which are taken one at a time, by quality."""
-    return sort_by_quality(measure_quality(frames))
-
-
 def measure_quality(frames: Iterable[FloatArray]) -> NDArray[np.float64]:
     """Quality, noise and mean brightness of every frame, (T, 3)."""
     greys = map(luminance, frames)
