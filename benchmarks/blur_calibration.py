@@ -25,7 +25,7 @@ from blur_clips import Case, cases, make_clip
 from provenance import publish
 from scipy import fft
 
-from turbrestore.blind.remove_blur import remove_blur, remove_blur_steps
+from turbrestore.blind.remove_blur import remove_blur_steps
 from turbrestore.blur.posterior import BlurWitnesses, measure_witnesses
 from turbrestore.blur.witnesses.hypotheses import shapes
 from turbrestore.blur.witnesses.spectral_variation import RINGS, SIDE
@@ -91,9 +91,11 @@ def measure_case(folder: Path, case: Case) -> Figures:
     truth = held["truth"] if case.kind == "quiet" else registered(held["truth"], image)
     (width,), (exponent,) = shapes(transfer_function(image, truth)[None])
     results = {
-        "alone": remove_blur(image, image),
+        "alone": finish(remove_blur_steps(image, image)),
         "posterior": finish(remove_blur_steps(image, image, witnesses=witnesses)),
-        "right": remove_blur(image, image, DeconvolutionParams(sigma=float(width), exponent=float(exponent))),
+        "right": finish(
+            remove_blur_steps(image, image, DeconvolutionParams(sigma=float(width), exponent=float(exponent)))
+        ),
     }
     found = results["posterior"].posterior
     images = {name: result.deconvolution.image for name, result in results.items()} | {"filtered": image}

@@ -23,7 +23,7 @@ import numpy as np
 from revisions import take_two_cores
 from scipy import fft
 
-from turbrestore.blind.remove_blur import remove_blur
+from turbrestore.blind.remove_blur import remove_blur_steps
 from turbrestore.blur.psf import KOLMOGOROV, blur_otf
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve_steps
 from turbrestore.deconvolution.nonlocal_prior.nonlocal_weights import nonlocal_weights
@@ -108,7 +108,7 @@ def run_child() -> None:
     After sixty iterations all earlier images are kept that the last one is compared with.
     """
     image = make_image(*LARGE)
-    remove_blur(image, image, DeconvolutionParams(iterations=60, tolerance=0))
+    finish(remove_blur_steps(image, image, DeconvolutionParams(iterations=60, tolerance=0)))
     # Linux counts kilobytes, macOS bytes.
     unit = 1024 if sys.platform != "darwin" else 1024 * 1024
     print(json.dumps({"peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit}))
@@ -136,7 +136,7 @@ def time_parts() -> bool:
 def whole_stage(height: int, width: int, runs: int = 2) -> float:
     """Seconds of the whole stage."""
     image = make_image(height, width)
-    return fastest(lambda: remove_blur(image, image), runs)
+    return fastest(lambda: finish(remove_blur_steps(image, image)), runs)
 
 
 def time_stage() -> bool:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from provenance import publish
 
-from turbrestore.blind.remove_blur import remove_blur
+from turbrestore.blind.remove_blur import remove_blur_steps
 from turbrestore.core.arrays import FloatArray
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.dynamics.dynamic_texture import identify
@@ -27,6 +27,7 @@ from turbrestore.metrics import compare
 from turbrestore.pipeline import RestoreParams, restore
 from turbrestore.registration.flow_algebra import compose_flows, invert_flow
 from turbrestore.registration.warp import warp
+from turbrestore.runtime.steps import finish
 from turbrestore.synthesis.anisoplanatic import phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
 from turbrestore.synthesis.scenes import SCENES
@@ -68,7 +69,7 @@ def measure(strength: str, kind: str, noise: float, name: str) -> Row:
     images = {
         "measured flow": whole.image,
         "flow of the model": restore(frames, RestoreParams(filter=drop, deconvolution=blur)).image,
-        "true flow": remove_blur(fused, whole.centroid.image, blur).deconvolution.image,
+        "true flow": finish(remove_blur_steps(fused, whole.centroid.image, blur)).deconvolution.image,
     }
     inner = np.s_[BORDER:-BORDER, BORDER:-BORDER]
     return {column: compare(image[inner], truth[inner]).psnr for column, image in images.items()}

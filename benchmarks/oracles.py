@@ -22,7 +22,7 @@ from blur_clips import part_of
 from clips import DRAWN_SCENES
 from provenance import publish
 
-from turbrestore.blind.remove_blur import remove_blur
+from turbrestore.blind.remove_blur import remove_blur_steps
 from turbrestore.blur.witnesses.hypotheses import shapes
 from turbrestore.core.arrays import FloatArray
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
@@ -30,6 +30,7 @@ from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
 from turbrestore.registration.flow_algebra import compose_flows, invert_flow
 from turbrestore.registration.warp import warp
+from turbrestore.runtime.steps import finish
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
 SCENES, SIDE, BORDER = DRAWN_SCENES[:3], 176, 12
@@ -110,7 +111,7 @@ def clip(scene: str, case: Case) -> tuple[FloatArray, FloatArray, FloatArray, Fl
 
 def deblurred(image: FloatArray, params: DeconvolutionParams) -> FloatArray:
     """Image without this blur."""
-    return remove_blur(image, image, params).deconvolution.image
+    return finish(remove_blur_steps(image, image, params)).deconvolution.image
 
 
 def blur_of(image: FloatArray, truth: FloatArray) -> DeconvolutionParams:

@@ -33,7 +33,7 @@ from quality import panel
 from revisions import child
 from words import can_read, share_read
 
-from turbrestore.blind.remove_blur import remove_blur
+from turbrestore.blind.remove_blur import remove_blur_steps
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import TurbrestoreError
 from turbrestore.footage.frame_selection import best_frames, frame_quality
@@ -41,6 +41,7 @@ from turbrestore.io.images.image_files import write_image
 from turbrestore.io.output import atomic_write
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
+from turbrestore.runtime.steps import finish
 
 # Share of the frames that a lucky average keeps: as the stacker does here.
 LUCKY = 0.5
@@ -152,7 +153,7 @@ def run_child(task: dict[str, Any]) -> dict[str, Any]:
     failed: dict[str, str] = {}
     if name in METHODS:
         METHODS[name](np.load(folder / f"{task['clips'][0]}.npy")[WARM])
-    remove_blur(*[np.load(folder / f"{task['clips'][0]}.npy")[WARM].mean(axis=0)] * 2)
+    finish(remove_blur_steps(*[np.load(folder / f"{task['clips'][0]}.npy")[WARM].mean(axis=0)] * 2))
     for clip in task["clips"]:
         frames = np.load(folder / f"{clip}.npy")
         begun = processor_seconds()
@@ -168,7 +169,7 @@ def run_child(task: dict[str, Any]) -> dict[str, Any]:
             continue
         begun = processor_seconds()
         if sharp is None:
-            sharp = remove_blur(merged, merged).deconvolution.image
+            sharp = finish(remove_blur_steps(merged, merged)).deconvolution.image
         spent[clip] = used | {"deblurring": processor_seconds() - begun}
         np.savez(folder / f"{name}-{clip}.npz", merged=merged, sharp=sharp)
     return {"clips": spent, "failed": failed}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from turbrestore.blind.guards import GuardParams
-from turbrestore.blind.remove_blur import guarded_steps, remove_blur, remove_blur_memory, remove_blur_steps
+from turbrestore.blind.remove_blur import guarded_steps, remove_blur_memory, remove_blur_steps
 from turbrestore.blur.psf import KOLMOGOROV, blur_otf
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve_steps
 from turbrestore.metrics import psnr
@@ -29,7 +29,7 @@ def camera():
 
 def test_a_blind_result_is_sharper_and_closer_to_the_scene(camera):
     scene, image = camera
-    result = remove_blur(image, image, WIENER, LENIENT)
+    result = finish(remove_blur_steps(image, image, WIENER, LENIENT))
     assert result.blur.sigma == pytest.approx(1.6, rel=0.25)
     assert result.deconvolution.sigma == result.blur.removable == result.readings[0].sigma
     assert psnr(result.deconvolution.image, scene) > psnr(image, scene) + 1
@@ -39,9 +39,9 @@ def test_a_blind_result_is_sharper_and_closer_to_the_scene(camera):
 
 def test_a_failed_guard_lowers_the_width(camera):
     _, image = camera
-    free = remove_blur(image, image, WIENER, LENIENT)
+    free = finish(remove_blur_steps(image, image, WIENER, LENIENT))
     bound = free.readings[0].noise_gain * 0.9
-    result = remove_blur(image, image, WIENER, replace(LENIENT, noise_gain=bound))
+    result = finish(remove_blur_steps(image, image, WIENER, replace(LENIENT, noise_gain=bound)))
     assert 0 < result.deconvolution.sigma < free.deconvolution.sigma
     assert [reading.passed for reading in result.readings][-2:] == [False, True]
     assert result.decisions[1].choice.startswith(f"blur lowered from {free.deconvolution.sigma:.2f} to")
@@ -49,7 +49,7 @@ def test_a_failed_guard_lowers_the_width(camera):
 
 def test_if_every_width_fails_nothing_is_removed(camera):
     _, image = camera
-    result = remove_blur(image, image, WIENER, GuardParams(noise_gain=1.0, overshoot=0.0))
+    result = finish(remove_blur_steps(image, image, WIENER, GuardParams(noise_gain=1.0, overshoot=0.0)))
     assert result.deconvolution.sigma == 0
     assert np.array_equal(result.deconvolution.image, image)
     assert "no blur removed" in result.decisions[1].choice
@@ -57,7 +57,7 @@ def test_if_every_width_fails_nothing_is_removed(camera):
 
 def test_guards_do_not_override_a_given_width(camera):
     _, image = camera
-    result = remove_blur(image, image, replace(WIENER, sigma=4.0))
+    result = finish(remove_blur_steps(image, image, replace(WIENER, sigma=4.0)))
     assert result.blur is None
     assert result.deconvolution.sigma == 4.0
     assert not result.readings[0].passed
@@ -98,8 +98,8 @@ def test_the_image_is_split_where_tiles_are_asked_for(camera):
     _, image = camera
     wide = np.tile(image, (3, 4))
     fixed = replace(WIENER, sigma=1.6, iterations=60, tolerance=0)
-    whole = remove_blur(wide, wide, fixed)
+    whole = finish(remove_blur_steps(wide, wide, fixed))
     assert remove_blur_memory(wide.shape, fixed, side=384) < remove_blur_memory(wide.shape, fixed)
-    tiled = remove_blur(wide, wide, fixed, side=384)
+    tiled = finish(remove_blur_steps(wide, wide, fixed, side=384))
     assert not np.array_equal(tiled.deconvolution.image, whole.deconvolution.image)
     assert np.abs(tiled.deconvolution.image - whole.deconvolution.image).max() < 0.02

@@ -26,7 +26,6 @@ from ..deconvolution.stopping import Steps
 from ..runtime.device import CPU, find_device
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import to_scratch
-from ..runtime.steps import finish
 from ..runtime.tiling import HALO, HaloTile, add_tile, halo_tiles, largest_tile, new_mosaic
 from .decisions import explain_blur, explain_guards, explain_posterior
 from .guards import BACK_OFF, GuardParams, GuardReading, evaluate_guards
@@ -61,18 +60,6 @@ class Deblurred:
     posterior: BlurPosterior | None = None  # none if the width was given, or nothing is known but the image
 
 
-def remove_blur(
-    image: FloatArray,
-    guide: FloatArray,
-    deconvolution: DeconvolutionParams | None = None,
-    guards: GuardParams | None = None,
-    runtime: Runtime = DEFAULT,
-    side: int | None = None,
-) -> Deblurred:
-    """Remove a blur of given or of estimated width from an image (H, W[, 3])."""
-    return finish(remove_blur_steps(image, guide, deconvolution, guards, runtime, side))
-
-
 def remove_blur_steps(
     image: FloatArray,
     guide: FloatArray,
@@ -86,7 +73,7 @@ def remove_blur_steps(
     full_scale: tuple[float, float] = (0.0, 1.0),
     noise: NoiseSpectrum | None = None,
 ) -> Steps[Deblurred]:
-    """Remove a blur step by step; see :func:`remove_blur`.
+    """Remove a blur of given or of estimated width from an image (H, W[, 3]) step by step.
 
     With ``side`` the image is deconvolved in tiles of at most that side, pixels, which takes less memory.  The blur
     is the one ``found``, by default by the image alone; ``psf`` (h, w) is the point spread function, if it is known.
@@ -162,7 +149,7 @@ def tiled_deconvolution_steps(
 
 
 def remove_blur_memory(shape: tuple[int, ...], params: DeconvolutionParams, side: int | None = None) -> float:
-    """Return the memory that :func:`remove_blur` takes beside the blurred image and its guide."""
+    """Return the memory that :func:`remove_blur_steps` takes beside the blurred image and its guide."""
     pixels, channels = shape[0] * shape[1], shape[2] if len(shape) == 3 else 1
     part = shape if side is None else (*largest_tile((shape[0], shape[1]), side), *shape[2:])
     beside = float(pixels * (_BYTES + channels * _CHANNEL_BYTES))
