@@ -50,17 +50,17 @@ def check_grey(image: ArrayLike, name: str = "image") -> FloatArray:
     return luminance(check_image(image, name))
 
 
-def check_frames(frames: ArrayLike, name: str = "frames", at_least: int = 1) -> FloatArray:
+def check_frames(frames: ArrayLike, at_least: int = 1) -> FloatArray:
     """Return ``frames`` as a finite float32 array of shape (T, H, W) or (T, H, W, 3).
 
     ``frames`` (T, H, W) or (T, H, W, 3).
     """
-    array = _as_float(frames, name)
+    array = _as_float(frames, "frames")
     if array.ndim not in (3, 4) or (array.ndim == 4 and array.shape[3] not in CHANNELS):
-        raise DataError(f"{name}: expected shape (T, H, W) or (T, H, W, 3), found {array.shape}")
+        raise DataError(f"frames: expected shape (T, H, W) or (T, H, W, 3), found {array.shape}")
     if len(array) < at_least:
-        raise DataError(f"{name}: expected at least {counted(at_least, 'frame')}, found {len(array)}")
-    return _finite(array, name)
+        raise DataError(f"frames: expected at least {counted(at_least, 'frame')}, found {len(array)}")
+    return _finite(array, "frames")
 
 
 def check_flow(flow: ArrayLike, name: str = "flow") -> FloatArray:
