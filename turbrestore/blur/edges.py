@@ -50,7 +50,7 @@ _BLACK, _WHITE, _BLACK_NOISE, _TAILS = 1, 99, 4.0, 0.02
 # Ratio of one width that is tried to the one before it.
 _RATIO = 1.05
 # Photographs are as soft as this, pixels; below it nothing is safe to remove.  Width and uncertainty of a sharp image.
-_SOFT, _SHARP, _PIXEL_UNCERTAINTY = 0.8, 0.35, 0.1
+SOFT, _SHARP, PIXEL_UNCERTAINTY = 0.8, 0.35, 0.1
 # Side of a tile, pixels.
 TILE = 16
 # Frequencies over which M is integrated, cycles per pixel.
@@ -140,8 +140,8 @@ def edge_limit(image: FloatArray, sigma: float, exponent: float) -> tuple[float,
     width = _widest_blur(image, GAUSSIAN, sigma)
     if width >= sigma:
         return None
-    if width < _SOFT:
-        return _SHARP, _PIXEL_UNCERTAINTY
+    if width < SOFT:
+        return _SHARP, PIXEL_UNCERTAINTY
     return width, _widest_blur(image, exponent, sigma) - width
 
 

@@ -48,7 +48,7 @@ from ..display.preview import preview
 from ..runtime.fourier import fast_length
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import ThreadTeam, one_thread_each
-from .edges import edge_limit
+from .edges import PIXEL_UNCERTAINTY, SOFT, edge_limit
 from .marginal_likelihood import WIDTHS, image_gradients, likeliest_width, width_costs
 from .psf import GAUSSIAN, Float64Array, check_exponent, fused_exponent
 
@@ -66,11 +66,9 @@ _SMOOTH, _NOISY = (1.5, 2.0), (0.03, 0.05)
 # Smallest width that a reduced image resolves, in its own pixels.
 _RESOLVED = 0.6
 # Evidence, in units of L, that a blur needs; and the evidence it needs if the image itself is to be preferred over its
-# reductions, or if it is no wider than ordinary photographs are soft (_SOFT pixels).  Fused images without blur reach
+# reductions, or if it is no wider than ordinary photographs are soft (SOFT pixels).  Fused images without blur reach
 # 0.22 there, blurred ones begin at 0.35.
 _EVIDENCE, _STRONG_EVIDENCE, _SOFT_EVIDENCE = 0.08, 0.2, 0.23
-_SOFT = 0.8
-_PIXEL_UNCERTAINTY = 0.1  # of the width of a sharp image, pixels
 # Side of the part that is analysed; rows of positions at which detail is measured at a time, and how far its filters
 # reach, pixels.
 _PART, _STRIP_ROWS, _REACH = 128, 256, 5
@@ -169,7 +167,7 @@ class BlurCandidate:
         found = self.estimate
         lowest = likeliest_width(found.costs)
         resolved = lowest < WIDTHS[-1] and (found.reduction == 1 or lowest >= _RESOLVED)
-        return resolved and found.evidence >= (_EVIDENCE if found.sigma >= _SOFT else _SOFT_EVIDENCE)
+        return resolved and found.evidence >= (_EVIDENCE if found.sigma >= SOFT else _SOFT_EVIDENCE)
 
 
 def estimate_blur(
@@ -261,7 +259,7 @@ def choose_blur(candidates: tuple[BlurCandidate, ...], runtime: Runtime = DEFAUL
         return min(plausible, key=_preference)
     sharp, asked = float(WIDTHS[0]), candidates[0].asked
     shape = fused_exponent(sharp) if asked is None else asked
-    return replace(candidates[0].estimate, sigma=sharp, uncertainty=_PIXEL_UNCERTAINTY, exponent=shape)
+    return replace(candidates[0].estimate, sigma=sharp, uncertainty=PIXEL_UNCERTAINTY, exponent=shape)
 
 
 def _preference(estimate: BlurEstimate) -> float:
