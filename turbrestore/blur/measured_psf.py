@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.arrays import check_grey
 from ..core.errors import DataError
+from ..core.robust import robust_scale
 from .psf import Float64Array
 
-# Width of the border whose median is the background, in shares of the side; a standard deviation in median absolute
-# deviations; deviations of the noise above which light is that of the point, and least ratio of peak and noise.
-_BORDER, _NORMAL, _SEEN, _CLEAR = 0.1, 1.4826, 3.0, 20.0
+# Width of the border whose median is the background, in shares of the side; deviations of the noise above which light
+# is that of the point, and least ratio of peak and noise.
+_BORDER, _SEEN, _CLEAR = 0.1, 3.0, 20.0
 # Share of the light that may lie beyond the border, share of the peak that a second point may have, and radius of the
 # largest PSF, pixels.
 _LOST, _SECOND, _LARGEST = 0.02, 0.2, 84
@@ -34,7 +35,7 @@ def psf_from_image(image: ArrayLike, name: str = "psf") -> Float64Array:
     rim = np.ones(grey.shape, bool)
     rim[frame:-frame, frame:-frame] = False
     background = float(np.median(grey[rim]))
-    noise = _NORMAL * float(np.median(np.abs(grey[rim] - background)))
+    noise = robust_scale(grey[rim] - background)
     light = grey - background
     peak = float(light.max())
     if peak <= max(_CLEAR * noise, 1e-6):
