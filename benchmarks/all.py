@@ -66,6 +66,7 @@ TABLES = {
     "flow_calls": Table("flow_calls.py", timed=True),
     "presets": Table("flow_calls.py --presets", timed=True),
     "speed": Table("speed.py", timed=True),
+    "history": Table("history.py", timed=True),
     "tvl1": Table("tvl1.py --quick", timed=True),
     "memory": Table("memory.py --quick", timed=True),
     "blur_training": Table("blur_training.py", missing=lambda: "its clips take hours, and its networks are kept"),

@@ -46,8 +46,6 @@ PHOTOGRAPHS = {
 # Kinds of scenes, simulators, and their shares of the clips.
 SCENES = {"leaves": 0.35, "text": 0.13, "bars": 0.05, "craters": 0.12, "photograph": 0.35}
 SHARES = {"screens": 0.27, "kernels": 0.18, "lens": 0.17, "mixed": 0.13, "near": 0.07, "none": 0.13, "close": 0.05}
-# Sides of a clip, of one close to the camera, and of a large one; share of text in large ones.
-SIDES, CLOSE_SIDES, LARGE_SIDES, LARGE_TEXT = (112, 177), (168, 224), (300, 450), 0.4
 # Pixels around a clip from which displacement brings in what the frame does not show at rest.
 MARGIN = 32
 # Widths of the stack of blurred scenes that ``mixed`` interpolates.
@@ -64,21 +62,15 @@ class SimulatedClip:
     truth: FloatArray
 
 
-def simulate(seed: int, simulator: str | None = None, large: bool = False) -> SimulatedClip:
-    """Draw everything about a clip from a seed, unless the simulator is given.
-
-    A large clip costs ten times as much, shows text more often, and tells of wider blur.
-    """
+def simulate(seed: int, simulator: str | None = None) -> SimulatedClip:
+    """Draw everything about a clip from a seed, unless the simulator is given."""
     rng = np.random.default_rng(seed)
     drawn = str(rng.choice(list(SHARES), p=list(SHARES.values())))
     simulator = simulator or drawn
-    sides = LARGE_SIDES if large else CLOSE_SIDES if simulator in ("near", "close") else SIDES
-    side = int(rng.integers(*sides))
+    side = int(rng.integers(168, 224)) if simulator in ("near", "close") else int(rng.integers(112, 177))
     name = str(rng.choice(list(SCENES), p=list(SCENES.values())))
-    if large and rng.uniform() < LARGE_TEXT:
-        name = "text"
     scene = draw_scene(name, side + 2 * MARGIN, rng)
-    count = int(np.exp(rng.uniform(np.log(4), np.log(60 if large else 100))))
+    count = int(np.exp(rng.uniform(np.log(4), np.log(100))))
     frames, truth = _SIMULATORS[simulator](scene, count, rng)
     if rng.uniform() < 0.1:
         _burn_in_title([*frames, truth], rng)

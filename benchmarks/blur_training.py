@@ -1,9 +1,9 @@
 """Training of the estimator of the blur on simulated clips.
 
-``python benchmarks/blur_training.py make FOLDER FIRST LAST [--large]`` restores the clips of the seeds from FIRST to
-before LAST (:mod:`blur_simulators`) up to the point where their blur is looked for, and keeps for each what the
-estimator then knows, the true transfer function, and the error of the image behind every blur that might be removed.
-Clips that are there are kept, so it goes on where it stopped.
+``python benchmarks/blur_training.py make FOLDER FIRST LAST`` restores the clips of the seeds FIRST to LAST − 1
+(:mod:`blur_simulators`) up to the point where their blur is looked for, and keeps for each what the estimator then
+knows, the true transfer function, and the error of the image behind every blur that might be removed.  Clips that are
+there are kept, so it goes on where it stopped.
 
 ``python benchmarks/blur_training.py train FOLDER [--write benchmarks/results/blur_training.md]`` trains the networks of
 :mod:`turbrestore.blur.learnt` and writes their weights.  The table is of networks that were trained without the
@@ -69,12 +69,11 @@ def main() -> int:
     make.add_argument("first", type=int)
     make.add_argument("last", type=int)
     make.add_argument("--simulator", choices=SHARES)
-    make.add_argument("--large", action="store_true")
     train.add_argument("--write", type=Path)
     given = parser.parse_args()
     if given.what == "make":
         given.folder.mkdir(exist_ok=True)
-        make_clips(given.folder, given.first, given.last, given.simulator, given.large)
+        make_clips(given.folder, given.first, given.last, given.simulator)
         return 0
     clips = read_clips(given.folder)
     publish(table_of(clips), given.write)
@@ -83,13 +82,13 @@ def main() -> int:
     return 0
 
 
-def make_clips(folder: Path, first: int, last: int, simulator: str | None, large: bool) -> None:
+def make_clips(folder: Path, first: int, last: int, simulator: str | None) -> None:
     """Simulate clips, and keep what is known of each in a file of the folder."""
     for seed in range(first, last):
-        path = folder / f"{'large_' * large}{simulator or 'any'}_{seed}.pkl"
+        path = folder / f"{simulator or 'any'}_{seed}.pkl"
         if not path.exists():
             begun = time.perf_counter()
-            clip = simulate(seed, simulator, large)
+            clip = simulate(seed, simulator)
             found = known_of(clip)
             partial = path.with_suffix(".part")
             partial.write_bytes(pickle.dumps({"seed": seed, "simulator": clip.simulator, "scene": clip.scene, **found}))

@@ -29,11 +29,13 @@ from turbrestore.io.video import open_frames
 from turbrestore.synthesis.anisoplanatic import phase_screen_frames
 from turbrestore.synthesis.atmosphere import STRENGTHS, PhaseScreenParams
 from turbrestore.synthesis.scenes import SCENES, printed_words
-from turbrestore.synthesis.smooth_flow import distort, smooth_flows
+from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
 # Synthetic clips: frames and pixels a side.
 COUNT, SMOOTH_SIDE, SCREEN_SIDE = 60, 192, 256
 SMOOTH_SCENES = ("chart", "camera", "words", "cat")
+# Scenes that strong air moves by this root mean square, pixels.
+STRONG_SCENES, STRONG_RMS = ("camera", "cat"), 5.0
 SCREEN_SCENES = (("weak", "chart"), ("medium", "camera"), ("medium", "brick"), ("strong", "words"))
 # Small print: tesseract reads all of it through a Gaussian of 1.5 px, and half of it through one of 2.5 px.
 TEXT = (
@@ -121,15 +123,16 @@ def _drawn(scene: str, kind: str, seed: int) -> Clip:
 
 def _synthetic() -> dict[str, Callable[[], Clip]]:
     smooth = {f"smooth_{scene}": partial(_smooth, scene) for scene in SMOOTH_SCENES}
+    strong = {f"strong_{scene}": partial(_smooth, scene, STRONG_RMS) for scene in STRONG_SCENES}
     screens = {f"screens_{strength}_{scene}": partial(_screens, strength, scene) for strength, scene in SCREEN_SCENES}
-    return {**smooth, **screens}
+    return {**smooth, **strong, **screens}
 
 
-def _smooth(scene: str) -> Clip:
+def _smooth(scene: str, rms: float = SmoothFlowParams.rms) -> Clip:
     """Smooth random flows without physics, a Gaussian blur that changes from frame to frame, and noise."""
     rng = np.random.default_rng(SMOOTH_SCENES.index(scene))
     truth, words = _scene(scene, SMOOTH_SIDE)
-    flows = smooth_flows(COUNT, SMOOTH_SIDE, SMOOTH_SIDE, rng)
+    flows = smooth_flows(COUNT, SMOOTH_SIDE, SMOOTH_SIDE, rng, SmoothFlowParams(rms=rms))
     # The scene is the geometry that is looked for.
     flows -= flows.mean(axis=0)
     frames = [distort(truth, flow[None], rng, blur=1 + rng.random(), noise=0.01)[0] for flow in flows]
