@@ -1,5 +1,6 @@
 """Every threshold of a detector says where it comes from."""
 
+import ast
 import dataclasses
 import importlib
 import re
@@ -11,6 +12,8 @@ PACKAGE, TESTS = Path(turbrestore.__file__).parent, Path(__file__).parents[1]
 KINDS = ("theory", "bits", "cost", "measured", "test", "chosen")
 # Thresholds that nothing holds; may only become fewer.
 MOST_CHOSEN = 28
+# Named numeric constants, and floats within functions; may only become fewer as well.
+MOST_NAMED, MOST_INLINE = 871, 338
 
 
 def records():
@@ -62,3 +65,36 @@ def test_one_without_a_source_is_refused():
     ):
         made = dataclasses.make_dataclass("Made", [("width", int, dataclasses.field(default=1, metadata=metadata))])
         assert complaint("Made", dataclasses.fields(made)[0], "def test_other():").startswith("Made.width: expected")
+
+
+def named_constants(tree):
+    """Names of module-level constants whose values contain numbers."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = [part.id for target in targets for part in ast.walk(target) if isinstance(part, ast.Name)]
+            if any(type(getattr(part, "value", None)) in (int, float) for part in ast.walk(node.value)):
+                yield from (name for name in names if re.fullmatch("_?[A-Z][A-Z0-9_]*", name))
+
+
+def inline_floats(tree):
+    """Places and values of the floats within functions, without those that need no explanation."""
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    found = {part for function in functions for line in function.body for part in ast.walk(line)}
+    floats = [part for part in found if isinstance(part, ast.Constant) and type(part.value) is float]
+    return [(part.lineno, part.value) for part in floats if part.value not in (0.0, 0.5, 1.0, 2.0)]
+
+
+def test_numbers_do_not_become_more():
+    trees = [ast.parse(path.read_text()) for path in sorted(PACKAGE.rglob("*.py"))]
+    named = sum(len([*named_constants(tree)]) for tree in trees)
+    inline = sum(len(inline_floats(tree)) for tree in trees)
+    advice = "measure the number, derive it, or name the source of one that is there in place of adding one"
+    assert named <= MOST_NAMED, f"{named} named constants, at most {MOST_NAMED}: {advice}"
+    assert inline <= MOST_INLINE, f"{inline} floats within functions, at most {MOST_INLINE}: {advice}"
+
+
+def test_numbers_are_counted():
+    tree = ast.parse("_WIDTH, SIDE = 3.0, 1 << 4\nNAMES = ('a',)\ndef f(x=0.3):\n    return 0.7 * x + 2.0")
+    assert [*named_constants(tree)] == ["_WIDTH", "SIDE"]
+    assert inline_floats(tree) == [(4, 0.7)]
