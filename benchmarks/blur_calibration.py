@@ -25,13 +25,14 @@ from blur_clips import Case, cases, make_clip
 from provenance import publish
 from scipy import fft
 
-from turbrestore.blind.remove_blur import remove_blur_steps
+from turbrestore.blind.remove_blur import find_blur, remove_blur_steps
 from turbrestore.blur.posterior import BlurWitnesses, measure_witnesses
 from turbrestore.blur.witnesses.hypotheses import shapes
 from turbrestore.blur.witnesses.spectral_variation import RINGS, SIDE
 from turbrestore.core.arrays import FloatArray
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.registration.warp import warp
+from turbrestore.runtime.runtime import DEFAULT
 from turbrestore.runtime.steps import finish
 from turbrestore.synthesis.atmosphere import phase_spectrum
 
@@ -90,9 +91,10 @@ def measure_case(folder: Path, case: Case) -> Figures:
     witnesses = measure_witnesses(frames, flows, image, BlurWitnesses(moved, float(len(frames))))
     truth = held["truth"] if case.kind == "quiet" else registered(held["truth"], image)
     (width,), (exponent,) = shapes(transfer_function(image, truth)[None])
+    blur = find_blur(image, DeconvolutionParams(), DEFAULT, witnesses)
     results = {
         "alone": finish(remove_blur_steps(image, image)),
-        "posterior": finish(remove_blur_steps(image, image, witnesses=witnesses)),
+        "posterior": finish(remove_blur_steps(image, image, found=blur)),
         "right": finish(
             remove_blur_steps(image, image, DeconvolutionParams(sigma=float(width), exponent=float(exponent)))
         ),
