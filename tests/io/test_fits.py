@@ -380,3 +380,10 @@ def test_rows_of_other_formats_are_said_to_begin_at_the_top(tmp_path):
     assert fits.getheader(tmp_path / "a.fits")["ROWORDER"] == "TOP-DOWN"
     write_fits(tmp_path / "b.fits", np.zeros((2, 2)), header=["OBJECT  = 'Moon    '".ljust(80)])
     assert "ROWORDER" not in fits.getheader(tmp_path / "b.fits")
+
+
+def test_the_colours_of_an_image_are_not_taken_for_frames(tmp_path):
+    write_fits(tmp_path / "a.fits", np.zeros((20, 30, 3)))
+    with pytest.raises(DataError, match="a single image in colour"):
+        open_frames(tmp_path / "a.fits")
+    assert read_image(tmp_path / "a.fits").image.shape == (20, 30, 3)

@@ -49,6 +49,9 @@ from ..pixels import PixelArray, demosaic, depth_of, full_scale_of
 from ..source import FrameSource
 from .fits_header import FitsImage, find_images
 
+# Begin of the card that says that the planes of a cube are colours.
+_IN_COLOUR = "CTYPE3  = 'RGB"
+
 
 @dataclass(frozen=True)
 class _Levels:
@@ -87,6 +90,8 @@ def open_fits(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, sin
         return _open_images(images, path, limits, f"its {len(images)} extensions of one size are taken for frames")
     image = images[0]
     frames = _as_frames(image, image.numbers(limits))
+    if frames.ndim == 3 and any(card.startswith(_IN_COLOUR) for card in image.cards):
+        raise DataError(f"{path}: a single image in colour; name a video, or the folder that holds the frames")
     if single and frames.ndim == 2:
         frames = frames[None]
     if frames.ndim == 2:

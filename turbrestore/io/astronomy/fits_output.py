@@ -60,6 +60,9 @@ def write_fits(
         # Cards of the input that break rules are written as they are, or repaired.
         warnings.simplefilter("ignore")
         images = [fits.PrimaryHDU(_planes_first(pixels), _kept(header, origin, fits))]
+        if pixels.ndim == 3:
+            # Else a reader would take the colours for three frames.
+            images[0].header["CTYPE3"] = "RGB"
         for line in history:
             images[0].header.add_history(_ascii(line))
         if uncertainty is not None:
