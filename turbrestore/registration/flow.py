@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..core.arrays import FloatArray, check_frames, check_grey, check_image, luminance
-from ..core.errors import DataError, require, require_between
+from ..core.errors import DataError, require, require_between, settings_of
 from ..core.noise import estimate_noise
 from ..runtime.device import CPU, find_device
 from ..runtime.runtime import DEFAULT, Runtime
@@ -209,7 +209,7 @@ def prepare_reference(
 
     Frames have at least the noise ``least_noise``, intensity: a single one does not tell smooth noise from detail.
     """
-    params = params or FlowParams()
+    params = settings_of(FlowParams, params)
     target = check_image(reference, "reference")
     if min(target.shape[:2]) < MIN_SIDE:
         raise DataError(
