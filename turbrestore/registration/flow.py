@@ -34,7 +34,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray, check_frames, check_grey, check_image, luminance
+from ..core.arrays import FloatArray, check_grey, check_image, check_unit_frames, check_unit_image, luminance
 from ..core.errors import DataError, require, require_between, settings_of
 from ..core.noise import estimate_noise
 from ..runtime.device import CPU, find_device
@@ -162,8 +162,8 @@ def estimate_flow(
     >>> bool(abs(np.median(flow[..., 0]) - 0.7) < 0.05)
     True
     """
-    stack = check_frames(frames)
-    target = prepare_reference(reference, params, runtime)
+    stack = check_unit_frames(frames)
+    target = prepare_reference(check_unit_image(reference, "reference"), params, runtime)
     flows = new_stack((*stack.shape[:3], 2), runtime.scratch)
     for _ in fill_frames(flows, (flow for _, flow in measure_flows(target, iter_frames(stack)))):
         pass
