@@ -14,7 +14,9 @@ from cyclopts import Parameter
 from turbrestore.core.errors import TurbrestoreError, require
 from turbrestore.core.extras import install_command
 from turbrestore.core.remarks import counted
+from turbrestore.core.verdict import RIGHT
 from turbrestore.io.limits import first_line
+from turbrestore.io.output import IMAGE_OUTPUT_SUFFIXES
 from turbrestore.report.batch_page import ClipRow, thumbnail_uri
 from turbrestore.runs.folder_lock import lock_folder
 from turbrestore.runs.run_folder import is_part
@@ -117,6 +119,10 @@ def batch(
     """
     parallel = check_cluster("batch", scheduler, workers)
     inputs, out = _folder_last(inputs, out)
+    require(
+        out.is_dir() or out.suffix.lower() not in IMAGE_OUTPUT_SUFFIXES,
+        f"{out}: expected a folder for the results, found the name of an image; restore writes one image",
+    )
     clips = find_clips(inputs)
     outputs = name_outputs(clips, out, f".{format}")
     count = 1 if scheduler or not parallel else processes(len(clips), memory_limit, workers)
@@ -270,8 +276,9 @@ def _told(finished: Iterable[ClipRow], count: int, quiet: bool) -> Iterator[Clip
             if progress is not None:
                 progress("batch", number, count)
             if progress is None or row.state == "failed":
-                result = row.reason if row.state == "failed" else f"{row.frames} frames in {row.seconds:.1f} s"
-                say(f"{number} of {count}: {row.input}: {result}", quiet)
+                verdict = f"check: {row.checks}" if row.checks else RIGHT
+                done = f"{row.frames} frames in {row.seconds:.1f} s; {verdict}"
+                say(f"{number} of {count}: {row.input}: {row.reason if row.state == 'failed' else done}", quiet)
 
 
 def _as_named(row: ClipRow, order: Order) -> ClipRow:

@@ -146,7 +146,8 @@ def explain(error: BaseException) -> tuple[str, int]:
 def _misuse(error: CycloptsError) -> str:
     """Say what is wrong with the words of a command, and where to look."""
     if isinstance(error, UnusedCliTokensError):
-        return f"{' '.join(error.unused_tokens or [])}: one word too many; --help says what is expected"
+        extra = " ".join(error.unused_tokens or [])
+        return f"{extra}: one word too many; a name with spaces needs quotes, and --help says what is expected"
     if isinstance(error, MissingArgumentError) and error.argument is not None:
         command = " ".join(["turbrestore", *(error.command_chain or ())])
         return f"{error.argument.name}: expected a value, found none; {command} --help says what is expected"

@@ -109,6 +109,7 @@ def deconvolve(
     require(output is not None, "OUTPUT: expected an image or a stage file to write, found none")
     assert output is not None
     deconvolution = known_sigma(sigma, deconvolution)
+    asked = deconvolution
     if input.is_dir() and psf is None and deconvolution.sigma is None:
         deconvolution = _as_in_run(input, deconvolution)
     require(psf is None or deconvolution.sigma is None, "--psf: contradicts --sigma; leave one of them out")
@@ -127,7 +128,8 @@ def deconvolve(
         bit_depth = 16 if source.suffix.lower() in STAGE_FILE else read_image(source, limits).bit_depth
     write_stage(output, deblurred.deconvolution, bit_depth, overwrite)
     for decision in deblurred.decisions:
-        say(f"{output}: {decision}", quiet)
+        of_run = decision.subject == "blur" and deconvolution.sigma != asked.sigma
+        say(f"{output}: {replace(decision, reason='as much as the run removed') if of_run else decision}", quiet)
 
 
 def stage_of_run(path: Path) -> tuple[Path, Path | None]:

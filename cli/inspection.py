@@ -20,7 +20,7 @@ from turbrestore.io.npy import map_npy
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames
 from turbrestore.memory_plan import training_share
-from turbrestore.metrics import appearance, compare, compare_flows
+from turbrestore.metrics import appearance, compare, compare_flows, part_shown
 from turbrestore.runs.stage_files import load_flows
 from turbrestore.stacking.quality import measure_quality, quality_table, sort_by_quality
 
@@ -128,7 +128,8 @@ def evaluate(
     reference : Path
         Image of the same size, such as a frame or the temporal mean: sharpness and overshoot are measured against it.
     clip : Path
-        Video, to compare its temporal mean as well.  What the result gained over the mean is what the restoration did.
+        Video, to compare its temporal mean as well, where the result shows it.  What the result gained over the mean is
+        what the restoration did.
     max_pixels : int
         Largest image to read, pixels; by default 67 million.
     json : bool
@@ -149,7 +150,8 @@ def evaluate(
             scene = read_input_image(truth, limits)
             figures |= dataclasses.asdict(compare(image, scene))
             if clip is not None:
-                mean = dataclasses.asdict(compare(temporal_mean(open_frames(clip, limits=limits)), scene))
+                whole = temporal_mean(open_frames(clip, limits=limits))
+                mean = dataclasses.asdict(compare(part_shown(whole, image), scene))
         if reference is not None:
             figures |= dataclasses.asdict(appearance(image, read_image(reference, limits).image))
     rounded, of_mean = ({name: _rounded(value) for name, value in some.items()} for some in (figures, mean))

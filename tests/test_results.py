@@ -37,6 +37,9 @@ def test_the_motion_of_the_verdict_is_that_of_the_flows(restoration):
     assert restoration.motion == pytest.approx(expected, rel=0.05)
 
 
+OF_THE_MEAN = (CheckKind.SCENE_CHANGES, CheckKind.CONTRADICTION)
+
+
 def widths(restoration, low, width, high):
     """The posterior with other quantiles of the width, the median of which is to be removed."""
     return replace(restoration.posterior, width=np.array([low, width, high]), removed=width)
@@ -78,6 +81,8 @@ def test_every_doubt_is_named_once_with_a_remedy(restoration):
         (check,) = verdict.checks
         assert check.text and check.remedy and "{" not in check.text + check.remedy
         assert str(verdict).endswith(f"; check: {check.text} ({check.remedy})")
+        # Rings are no sharpness.
+        assert ("times as sharp" in verdict.gained) == (kind not in (CheckKind.TOO_SHARP, *OF_THE_MEAN))
     assert f"{frames} frames" in restoration.verdict.gained
 
 

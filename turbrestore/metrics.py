@@ -181,6 +181,16 @@ def align(result: ArrayLike, truth: ArrayLike) -> tuple[FloatArray, FloatArray]:
     return a[inside, inside], t[inside, inside]
 
 
+def part_shown(whole: FloatArray, image: FloatArray) -> FloatArray:
+    """Cut the part out of an image (H', W'[, 3]) that a smaller one (H, W[, 3]) of the same scene shows."""
+    height, width = image.shape[:2]
+    if height > whole.shape[0] or width > whole.shape[1]:
+        return whole
+    match = cv2.matchTemplate(_grey(whole, "whole"), _grey(image, "image"), cv2.TM_CCOEFF_NORMED)
+    y, x = np.unravel_index(int(match.argmax()), match.shape)
+    return whole[y : y + height, x : x + width]
+
+
 def comparable(image: FloatArray, name: str) -> FloatArray:
     """Return an image if it is large enough for :func:`compare`.
 

@@ -216,7 +216,8 @@ def _gained(restoration: Restoration, motion: float) -> str:
     removed = [f"{motion:.2f} pixels of motion"]
     if restoration.deconvolution is not None and restoration.deconvolution.sigma > 0:
         removed.append(f"{restoration.deconvolution.sigma:.2f} pixels of blur")
-    sharper = "" if math.isnan(gain) else f"{gain:.2f} times as sharp as the mean of "
+    # Rings and noise are no sharpness.
+    sharper = "" if math.isnan(gain) or _is_too_sharp(restoration) else f"{gain:.2f} times as sharp as the mean of "
     objects = ", moving objects replaced by the background" if restoration.objects_replaced else ""
     return f"{sharper}{count}, with {' and '.join(removed)} removed{objects}"
 
@@ -253,11 +254,11 @@ def _checks(restoration: Restoration, motion: float) -> Iterator[Check]:
 
 
 def _checks_of_blur(restoration: Restoration) -> Iterator[Check]:
-    done, readings = restoration.deconvolution, restoration.guard_readings
+    done = restoration.deconvolution
     if done is None:
         return
     removed = float(done.sigma)
-    if removed > 0 and readings and not readings[-1].passed:
+    if _is_too_sharp(restoration):
         yield write_check(CheckKind.TOO_SHARP, removed)
     if restoration.posterior is None:
         return
@@ -268,6 +269,12 @@ def _checks_of_blur(restoration: Restoration) -> Iterator[Check]:
     decided = float(restoration.posterior.removed)
     if removed < _HALF * decided:
         yield write_check(CheckKind.BLUR_LEFT if removed > 0 else CheckKind.NO_BLUR_REMOVED, decided, removed)
+
+
+def _is_too_sharp(restoration: Restoration) -> bool:
+    """Whether the guards object to what was removed."""
+    done, readings = restoration.deconvolution, restoration.guard_readings
+    return done is not None and done.sigma > 0 and bool(readings) and not readings[-1].passed
 
 
 def _share_of_air(flows: FloatArray) -> float:

@@ -26,6 +26,12 @@ def test_the_mean_of_the_clip_stands_beside_the_result(run, tmp_path, sequence):
     assert code == 0 and rows[0].split() == ["result", "mean"]
     assert rows[1].split()[:4] == ["psnr", f"{figures['psnr']:g}", f"{figures['temporal_mean']['psnr']:g}", "dB,"]
     assert all(", higher is better" in row or ", lower is better" in row or "is best" in row for row in rows[1:])
+    # Where the result is a part of the scene, so is the mean.
+    part = sequence.frames.mean(axis=0)[4:-12, 10:-2]
+    write_image(tmp_path / "part.tif", part, 32)
+    code, out, _ = run("evaluate", tmp_path / "part.tif", *words[2:], "--json")
+    figures = json.loads(out)
+    assert code == 0 and figures["temporal_mean"]["psnr"] == pytest.approx(figures["psnr"], abs=1e-2)
     code, _, err = run("evaluate", tmp_path / "result.tif", "--reference", tmp_path / "truth.tif", "--clip", words[-1])
     assert code == 2 and "--clip: has no effect without a truth" in err
 

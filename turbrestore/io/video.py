@@ -227,7 +227,7 @@ def _open(
     elif suffix in ANIMATION_SUFFIXES:
         source = open_animation(path, stop, limits, skip_damaged)
     elif suffix in IMAGE_SUFFIXES:
-        raise DataError(f"{path}: a single image; name the folder that holds the frames")
+        raise DataError(f"{path}: a single image; name a video, or the folder that holds the frames")
     elif suffix in CONTAINER_SUFFIXES or is_container(path):
         source = open_container(path, frames, limits, skip_damaged, keep_hdr)
     else:

@@ -90,7 +90,7 @@ def open_fits(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, sin
     if single and frames.ndim == 2:
         frames = frames[None]
     if frames.ndim == 2:
-        raise DataError(f"{path}: a single image; name the folder that holds the frames")
+        raise DataError(f"{path}: a single image; name a video, or the folder that holds the frames")
     limits.check_count(len(frames), str(path))
     read = MappedFrames.of(frames) if isinstance(frames, np.memmap) else lambda chosen: (frames[n] for n in chosen)
     return _source(images, path, frames.shape, lambda chosen: ((image, frame) for frame in iter_frames(read(chosen))))

@@ -162,7 +162,7 @@ def open_animation(path: Path, stop: int | None, limits: Limits, skip_damaged: b
         skipped = int(bool(image.info.get("default_image")))
         count, kind, mode = getattr(image, "n_frames", 1) - skipped, str(image.format).lower(), image.mode
     if count < 2:
-        raise DataError(f"{path}: a single image; name the folder that holds the frames")
+        raise DataError(f"{path}: a single image; name a video, or the folder that holds the frames")
     limits.check_count(count, str(path))
     shape: tuple[int, ...] = ()
     durations: list[float] = []
