@@ -211,7 +211,7 @@ def deconvolve(
     Raises
     ------
     DataError
-        Wrong shapes, values that are not finite, or an unusable PSF.
+        Wrong shapes, values that are not finite or on another scale than 0 to 1, or an unusable PSF.
     ConfigurationError
         The blur is not given, negative or not finite, or the memory of the device is not enough.
 

@@ -117,7 +117,10 @@ def filter_frames(
     Raises
     ------
     DataError
-        No frame counts, fewer frames than known flows, shapes that do not agree, or values that are not finite.
+        No frame counts, fewer frames than known flows, shapes that do not agree, or values that are not finite or on
+        another scale than 0 to 1.
+    ConfigurationError
+        ``dynamics`` or settings are of another kind.
 
     Examples
     --------

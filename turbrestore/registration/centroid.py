@@ -166,9 +166,9 @@ def find_centroid(
     Raises
     ------
     DataError
-        Fewer than two frames, wrong shapes or values that are not finite.
+        Fewer than two frames, wrong shapes, values that are not finite or on another scale than 0 to 1.
     ConfigurationError
-        ``start`` is not a frame.
+        ``start`` is not a frame, or settings are of another kind.
 
     Examples
     --------

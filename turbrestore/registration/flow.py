@@ -149,7 +149,7 @@ def estimate_flow(
     Raises
     ------
     DataError
-        Shapes do not agree, an image is smaller than 16×16, or values are not finite.
+        Shapes do not agree, an image is smaller than 16×16, or values are not finite or on another scale than 0 to 1.
 
     Examples
     --------
