@@ -15,7 +15,7 @@ from turbrestore.blind.remove_blur import SIGMAS_A_SIDE, remove_blur_steps
 from turbrestore.blur.measured_psf import psf_from_image
 from turbrestore.blur.posterior import BlurPosterior
 from turbrestore.core.arrays import FloatArray, luminance
-from turbrestore.core.errors import ConfigurationError, require, require_between
+from turbrestore.core.errors import ConfigurationError, InputNotFoundError, require, require_between
 from turbrestore.core.gradient import sobel_gradient
 from turbrestore.core.remarks import counted
 from turbrestore.deconvolution.deconvolve import Deconvolution, DeconvolutionParams
@@ -135,6 +135,9 @@ def deconvolve(
 def stage_of_run(path: Path) -> tuple[Path, Path | None]:
     """Return the stage file to deblur and its guide: of a folder those of a kept run, of a file itself and none."""
     if not path.is_dir():
+        # Without a suffix it may be a folder that is not there.
+        if not (path.suffix or path.exists() or str(path) == "-"):
+            raise InputNotFoundError(f"{path}: no such file or folder")
         return path, None
     filtered, centroid = path / "filtered.npz", path / "centroid.npz"
     require(

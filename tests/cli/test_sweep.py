@@ -29,6 +29,7 @@ def test_widths_of_a_kept_run_stand_side_by_side(run, clip, tmp_path):
     fails(run("deconvolve", kept, tmp_path / "b.png", "--sweep", "1,50"), 2, "--sweep: expected 0 to 10")
     fails(run("deconvolve", tmp_path, tmp_path / "b.png"), 2, "restore --keep")
     fails(run("deconvolve", kept), 2, "OUTPUT")
+    fails(run("deconvolve", tmp_path / "other", "--sweep", "1"), 66, "no such file or folder")
     assert not (tmp_path / "b.png").exists()
     # Without a sweep the folder stands for its filtered image, guided by its centroid.
     words = ("--sigma", "1", *quick, "--quiet")

@@ -373,3 +373,10 @@ def test_darks_and_flats_of_a_bayer_sensor_come_before_colours(written, tmp_path
     source = calibrated(open_frames(clip), make_calibration(open_frames(clip), open_fits(single, single=True), None))
     expected = np.broadcast_to(np.array([200, 120, 30]) / 510, (4, 12, 14, 3))
     np.testing.assert_allclose(source.select(roi=(2, 2, 14, 12)).read(), expected, atol=1e-4)
+
+
+def test_rows_of_other_formats_are_said_to_begin_at_the_top(tmp_path):
+    write_fits(tmp_path / "a.fits", np.zeros((2, 2)))
+    assert fits.getheader(tmp_path / "a.fits")["ROWORDER"] == "TOP-DOWN"
+    write_fits(tmp_path / "b.fits", np.zeros((2, 2)), header=["OBJECT  = 'Moon    '".ljust(80)])
+    assert "ROWORDER" not in fits.getheader(tmp_path / "b.fits")

@@ -105,6 +105,9 @@ def write_fits_cube(
 
 def _kept(cards: Sequence[str], origin: tuple[int, int], fits: Any) -> Header:
     """Cards of the input that are still true of the image."""
+    if not cards:
+        # The rows of other formats begin at the top, those of a FITS file where its writer has begun.
+        return fits.Header({"ROWORDER": "TOP-DOWN"})
     header, before = fits.Header(), fits.Header.fromstring("".join(cards).encode("ascii", "replace"))
     before.strip()
     for card in before.cards:
