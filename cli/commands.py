@@ -167,7 +167,7 @@ def as_typed(message: str, words: list[str]) -> str:
     if len(fitting) == 1:
         message = f"{fitting[0]}{colon}{rest}"
     message = message.replace("allow damaged ones to be skipped", "add --skip-damaged")
-    return message.replace("allow overwriting", "add --overwrite")
+    return message.replace("pass overwrite=True", "add --overwrite")
 
 
 def _full_output() -> str:

@@ -115,7 +115,7 @@ def test_a_shift_of_the_whole_frame_is_no_doubt_about_the_geometry(restoration):
 
 def test_only_the_frames_that_are_kept_tell_the_geometry(restoration):
     (few,) = replace(restoration, filtered=only(restoration, 7)).verdict.checks
-    assert few.text.startswith("7 frames ")
+    assert few.text.startswith("with 7 frames, ")
     bent = replace(restoration, filtered=only(restoration, 12), dynamics=replace(restoration.dynamics, R=1600.0))
     (geometry,) = bent.verdict.checks
     assert geometry.kind is CheckKind.GEOMETRY and " 12 frames tell " in geometry.text

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
+from turbrestore.core.verdict import CheckKind
 from turbrestore.dynamics.flow_model import mean_flow_error
 from turbrestore.pipeline import restore
 from turbrestore.registration.coverage import coverage
@@ -16,7 +17,7 @@ from turbrestore.report.facts import settings
 from turbrestore.runs.run_record import RunRecord
 from turbrestore.seeing.strength import LARGEST_BLUR, Estimate
 from turbrestore.settings import RestoreParams
-from turbrestore.wording import explain_seeing
+from turbrestore.wording import explain_seeing, write_check
 from turbrestore_cli.options import Machine, Selection
 from turbrestore_cli.output import settings_record
 
@@ -74,6 +75,12 @@ def test_every_figure_of_every_decision_is_that_of_the_result(result):
         shifts = np.median(result.centroid.flows[:, ::4, ::4].reshape(len(result.centroid.flows), -1, 2), axis=1)
         assert stated["camera"] == [f"{np.hypot(*shifts.T).max():.1f}"]
     assert not any(re.search(r"\b(inf|nan)\b", f"{one.choice} {one.reason}") for one in result.decisions)
+
+
+@pytest.mark.parametrize("frames", ["1 frame", "7 frames"])
+def test_few_frames_of_any_number_make_a_sentence(frames):
+    text = write_check(CheckKind.FEW_FRAMES, frames, 0.42, 8).text
+    assert text.startswith(f"with {frames}, neither the motion nor the noise averages out, and the geometry is known")
 
 
 def test_flow_and_blur_agree_only_where_their_intervals_overlap():

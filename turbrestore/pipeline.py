@@ -14,7 +14,7 @@ from .blind.remove_blur import SIGMAS_A_SIDE, Deblurred, find_blur, remove_blur_
 from .blur.measured_psf import psf_from_image
 from .core.arrays import FloatArray
 from .core.decision import Decision
-from .core.errors import require
+from .core.errors import require, settings_of
 from .core.noise import NoiseCurve
 from .deconvolution.problem import read_blur
 from .dynamics.dynamic_texture import identify
@@ -121,7 +121,7 @@ def restore(
     >>> restoration.image.shape, restoration.train
     ((64, 64), 6)
     """
-    params = params or RestoreParams()
+    params = settings_of(RestoreParams, params)
     begun = time.perf_counter()
     source, blank_decisions = (
         (frames, ()) if isinstance(frames, FrameSource) else without_blank(FrameSource.from_array(frames))

@@ -51,7 +51,7 @@ _CHECKS = {
         "take the mean of the frames if lines are broken that are whole there",
     ),
     CheckKind.FEW_FRAMES: (
-        "{0} average out neither the motion nor the noise, and tell the geometry to {1:.1f} pixels only",
+        "with {0}, neither the motion nor the noise averages out, and the geometry is known to {1:.1f} pixels only",
         "use at least {2}",
     ),
     CheckKind.GEOMETRY: (

@@ -16,7 +16,7 @@ from ..job import one_line
 
 # What the page calls the options that errors, decisions and verdicts name; longer ones first.
 _LABELS = {
-    "allow overwriting": "tick Replace existing files",
+    "pass overwrite=True": "tick Replace existing files",
     "leave out --sigma": "press As measured",
     "--roi X,Y,WIDTH,HEIGHT of": "under Region, choose",
     "--roi X,Y,WIDTH,HEIGHT": "Region",

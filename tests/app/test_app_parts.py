@@ -272,7 +272,7 @@ class TestTab:
 
 
 def test_errors_name_the_fields_of_the_page():
-    assert labelled("a.png: exists already; choose another name or allow overwriting").endswith(
+    assert labelled("a.png: exists already; choose another name or pass overwrite=True").endswith(
         "choose another name or tick Replace existing files"
     )
     assert labelled("--frames: expected start:stop, found '1'") == "Frames: expected start:stop, found '1'"

@@ -51,7 +51,7 @@ def test_a_constant_image_stays_what_it_is(method, boundary):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_without_blur_the_image_is_left_alone(method):
-    image = np.random.default_rng(11).normal(0.5, 0.5, (12, 12, 3)).astype(np.float32)
+    image = np.random.default_rng(11).normal(0.5, 0.3, (12, 12, 3)).astype(np.float32)
     for nothing in (0, np.ones((1, 1))):
         result = deconvolve(image, nothing, DeconvolutionParams(method=method))
         assert np.array_equal(result.image, image)

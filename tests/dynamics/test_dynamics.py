@@ -195,9 +195,9 @@ GOOD = np.zeros((4, 3, 3, 2), np.float32)
     [
         (np.zeros((1, 3, 3, 2), np.float32), "at least 2 flows"),
         (np.zeros(()), "at least 2 flows"),
-        (np.zeros((4, 3, 3), np.float32), "one shape"),
-        (np.zeros((4, 3, 3, 3), np.float32), "one shape"),
-        (np.zeros((4, 0, 3, 2), np.float32), "one shape"),
+        (np.zeros((4, 3, 3), np.float32), "T, H, W, 2"),
+        (np.zeros((4, 3, 3, 3), np.float32), "T, H, W, 2"),
+        (np.zeros((4, 0, 3, 2), np.float32), "T, H, W, 2"),
         ([np.zeros((3, 3, 2)), np.zeros((3, 4, 2))], "one shape"),
         ([], "at least 2 flows"),
         (iter(GOOD), "make a list"),

@@ -14,6 +14,7 @@ One sign rule holds everywhere: ``reference(x, y) ≈ frame(x + dx, y + dy)``.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from typing import Any
 
@@ -45,6 +46,24 @@ def check_image(image: ArrayLike, name: str = "image") -> FloatArray:
     return _finite(array, name)
 
 
+def check_unit_image(image: ArrayLike, name: str = "image") -> FloatArray:
+    """Return what :func:`check_image` does; an image on another scale than 0 to 1 is refused."""
+    return _on_unit_scale(check_image(image, name), name)
+
+
+def check_unit_frames(frames: ArrayLike, at_least: int = 1) -> FloatArray:
+    """Return what :func:`check_frames` does; frames on another scale than 0 to 1 are refused."""
+    return _on_unit_scale(check_frames(frames, at_least), "frames")
+
+
+def check_scale(lowest: float, highest: float, name: str, margin: float) -> None:
+    """Refuse intensities from ``lowest`` to ``highest`` that lie more than ``margin`` outside [0, 1]."""
+    if lowest < -margin or highest > 1 + margin:
+        raise DataError(
+            f"{name}: expected values in 0 to 1, found {lowest:.6g} to {highest:.6g}; divide them by full scale"
+        )
+
+
 def check_grey(image: ArrayLike, name: str = "image") -> FloatArray:
     """Return the luminance of ``image``, (H, W) or (H, W, 3), as a finite float32 array of shape (H, W)."""
     return luminance(check_image(image, name))
@@ -55,12 +74,12 @@ def check_frames(frames: ArrayLike, at_least: int = 1) -> FloatArray:
 
     ``frames`` (T, H, W) or (T, H, W, 3).
     """
-    array = _as_float(frames, "frames")
+    array = _as_float(frames, "frames", "turbrestore.open_frames")
     if array.ndim not in (3, 4) or (array.ndim == 4 and array.shape[3] not in CHANNELS):
         raise DataError(f"frames: expected shape (T, H, W) or (T, H, W, 3), found {array.shape}")
     if len(array) < at_least:
         raise DataError(f"frames: expected at least {counted(at_least, 'frame')}, found {len(array)}")
-    return _finite(array, "frames")
+    return _finite(array, "frames", "; clean_source(source, check_content(source)) fills them")
 
 
 def check_flow(flow: ArrayLike, name: str = "flow") -> FloatArray:
@@ -117,8 +136,34 @@ def _parts(array: NDArray[Any]) -> Iterator[NDArray[Any]]:
     return (array[start : start + step] for start in range(0, len(array), step))
 
 
-def _as_float(values: ArrayLike, name: str) -> FloatArray:
-    array = np.asarray(values)
+def as_array(values: Any, name: str, reader: str) -> NDArray[Any]:
+    """Return an array; raise DataError for a path, which ``reader`` reads, for arrays of two shapes and other objects.
+
+    What holds an array is refused too, because several of its arrays may be meant.
+    """
+    if isinstance(values, str | os.PathLike):
+        raise DataError(f"{name}: expected numbers, found the path {os.fspath(values)}; open it with {reader}")
+    try:
+        array = np.asanyarray(values)
+    except ValueError:
+        shapes = dict.fromkeys(str(getattr(part, "shape", type(part).__name__)) for part in values)
+        raise DataError(f"{name}: expected one shape, found {' beside '.join(shapes)}; crop them to one size") from None
+    if array.dtype == object:
+        found = f"{name}: expected numbers, found {type(values).__name__}"
+        held = next((f"; use its .{part}" for part in ("read()", "image") if hasattr(values, part.rstrip("()"))), "")
+        raise DataError(found + held)
+    return array
+
+
+def _on_unit_scale(array: FloatArray, name: str) -> FloatArray:
+    # Splines overshoot: registered frames, the centroid and the filtered image exceed the range of the frames by up to
+    # 0.7 of it (the Lebesgue constant of cubic splines, 1.55, squared).  Other scales (0 to 255, 0 to 4095) go further.
+    check_scale(float(array.min()), float(array.max()), name, margin=1.0)
+    return array
+
+
+def _as_float(values: ArrayLike, name: str, reader: str = "turbrestore.read_image") -> FloatArray:
+    array = np.asarray(as_array(values, name, reader))
     if np.issubdtype(array.dtype, np.unsignedinteger):
         return (array / np.float32(np.iinfo(array.dtype).max)).astype(np.float32)
     if not np.issubdtype(array.dtype, np.floating):
@@ -126,11 +171,16 @@ def _as_float(values: ArrayLike, name: str) -> FloatArray:
     return array.astype(np.float32, copy=False)
 
 
-def _finite(array: FloatArray, name: str) -> FloatArray:
+def not_finite(values: NDArray[Any], name: str, remedy: str = "") -> DataError:
+    """Count the values that are not finite."""
+    bad = int(values.size - np.count_nonzero(np.isfinite(values)))
+    return DataError(f"{name}: expected finite values, found {counted(bad, 'NaN or infinite value')}{remedy}")
+
+
+def _finite(array: FloatArray, name: str, remedy: str = "") -> FloatArray:
     if array.size == 0:
         raise DataError(f"{name}: expected at least one pixel, found shape {array.shape}")
     # In parts, without a temporary of the array's size.
     if not all(np.isfinite(part).all() for part in _parts(array)):
-        bad = int(array.size - np.count_nonzero(np.isfinite(array)))
-        raise DataError(f"{name}: expected finite values, found {bad} NaN or infinite ones")
+        raise not_finite(array, name, remedy)
     return array

@@ -4,6 +4,10 @@ Each message is one line: what was expected, what was found, what to do.  ``exit
 command line; the numbers follow the BSD ``sysexits`` convention.
 """
 
+from typing import TypeVar
+
+Kind = TypeVar("Kind")
+
 
 class TurbrestoreError(Exception):
     """Base class of every expected failure."""
@@ -44,6 +48,18 @@ class StorageError(TurbrestoreError):
 def require_between(name: str, value: float, low: float, high: float, unit: str = "") -> None:
     """Raise :class:`ConfigurationError` unless ``low <= value <= high``; NaN never does."""
     require(low <= value <= high, f"{name}: expected {low:g} to {high:g}{' ' * bool(unit)}{unit}, found {value:g}")
+
+
+def require_type(name: str, value: object, kind: type[Kind], remedy: str) -> Kind:
+    """Return ``value``, or raise :class:`ConfigurationError` unless it is of the type ``kind``."""
+    if not isinstance(value, kind):
+        raise ConfigurationError(f"{name}: expected {kind.__name__}, found {type(value).__name__}; {remedy}")
+    return value
+
+
+def settings_of(kind: type[Kind], value: Kind | None, name: str = "params") -> Kind:
+    """Return settings of the type ``kind``, by default its own; raise :class:`ConfigurationError` for others."""
+    return kind() if value is None else require_type(name, value, kind, f"write {kind.__name__}(...)")
 
 
 def require(condition: bool, message: str) -> None:

@@ -24,8 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..blur.estimation import BlurEstimate
 from ..blur.psf import GAUSSIAN, blur_otf, check_exponent, half_frequency, psf_to_otf
-from ..core.arrays import FloatArray, check_grey, check_image, luminance
-from ..core.errors import ConfigurationError, DataError, require, require_between
+from ..core.arrays import FloatArray, check_grey, check_image, check_unit_image, luminance
+from ..core.errors import ConfigurationError, DataError, require, require_between, settings_of
 from ..core.noise import NoiseCurve, estimate_noise
 from ..core.noise_spectrum import NoiseSpectrum
 from ..display.curves import plot_objective
@@ -211,7 +211,7 @@ def deconvolve(
     Raises
     ------
     DataError
-        Wrong shapes, values that are not finite, or an unusable PSF.
+        Wrong shapes, values that are not finite or on another scale than 0 to 1, or an unusable PSF.
     ConfigurationError
         The blur is not given, negative or not finite, or the memory of the device is not enough.
 
@@ -224,7 +224,9 @@ def deconvolve(
     >>> bool(np.abs(result.image - square).mean() < 0.3 * np.abs(blurred - square).mean())
     True
     """
-    return finish(deconvolve_steps(image, sigma_or_psf, params, guide, runtime, spectrum=noise))
+    pixels = check_unit_image(image)
+    guide = None if guide is None else check_unit_image(guide, "guide")
+    return finish(deconvolve_steps(pixels, sigma_or_psf, params, guide, runtime, spectrum=noise))
 
 
 def deconvolve_steps(
@@ -242,7 +244,7 @@ def deconvolve_steps(
     ``photons`` is the noise of the image at every level, relative to its mean; ``full_scale`` is black and white, to
     which the result is clipped; ``spectrum`` is the noise of the luminance, if the frames have told it.
     """
-    params = params or DeconvolutionParams()
+    params = settings_of(DeconvolutionParams, params)
     pixels = check_image(image)
     if sigma_or_psf is None:
         if params.sigma is None:

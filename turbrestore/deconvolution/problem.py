@@ -154,8 +154,8 @@ def read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | No
     if np.ndim(sigma_or_psf) == 0:
         sigma: Any = sigma_or_psf
         require(
-            np.isfinite(sigma) and sigma >= 0,
-            f"sigma_or_psf: expected a finite number of 0 or more pixels, found {sigma}",
+            np.asarray(sigma).dtype.kind in "fiu" and np.isfinite(sigma) and sigma >= 0,
+            f"sigma_or_psf: expected a finite number of 0 or more pixels, found {sigma!r}",
         )
         return None, float(sigma), int(np.ceil(MARGIN_SIGMAS * sigma))
     psf = check_psf(sigma_or_psf)

@@ -30,6 +30,7 @@ strip by strip. The sums are float64: rounding in float32 would hide the small s
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +38,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.arrays import FloatArray, check_flow
-from ..core.errors import DataError, require_between
+from ..core.errors import DataError, require_between, settings_of
 from ..core.remarks import counted
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import iter_slices, new_stack, to_scratch
@@ -139,7 +140,7 @@ def identify(
     >>> dynamics.rank, np.abs(dynamics.eigenvalues).round(3)
     (2, array([1., 1.]))
     """
-    params = params or DynamicsParams()
+    params = settings_of(DynamicsParams, params)
     strips = FlowStrips.of(flows, runtime.threads)
     mean, gram, norm = gram_matrix(strips)
     singular_values, V = singular_vectors(gram)
@@ -257,6 +258,10 @@ class FlowStrips:
         """Check the shapes of flows, an array (τ, H, W, 2) or an iterable of arrays (H, W, 2)."""
         if isinstance(flows, np.ndarray):
             shapes = [flows.shape[1:]] * len(flows) if flows.ndim else []
+        elif isinstance(flows, str | os.PathLike):
+            raise DataError(f"flows: expected flows (T, H, W, 2), found the path {flows}; read it with numpy.load")
+        elif hasattr(flows, "flows"):
+            raise DataError(f"flows: expected flows (T, H, W, 2), found {type(flows).__name__}; use its .flows")
         elif not isinstance(flows, Iterable) or iter(flows) is flows:
             raise DataError(
                 f"flows: expected an array or an iterable that can be iterated again, "
@@ -267,7 +272,9 @@ class FlowStrips:
         if len(shapes) < 2:
             raise DataError(f"flows: expected at least 2 flows, found {len(shapes)}")
         for shape in shapes:
-            if len(shape) != 3 or shape[2] != 2 or 0 in shape or shape != shapes[0]:
+            if len(shape) != 3 or shape[2] != 2 or 0 in shape:
+                raise DataError(f"flows: expected flows (T, H, W, 2), found {(len(shapes), *shape)}")
+            if shape != shapes[0]:
                 raise DataError(f"flows: expected all of one shape (H, W, 2), found {shape} beside {shapes[0]}")
         height, width = shapes[0][:2]
         return cls(flows, len(shapes), height, width, threads if isinstance(flows, np.ndarray) else 1)

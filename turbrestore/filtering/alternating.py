@@ -45,8 +45,8 @@ from itertools import chain, islice, repeat
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import FloatArray, check_flow, check_image
-from ..core.errors import DataError
+from ..core.arrays import FloatArray, check_flow, check_image, check_unit_image
+from ..core.errors import DataError, require_type, settings_of
 from ..dynamics.flow_model import FlowDynamics
 from ..registration.flow import FlowParams, iterate_flows
 from ..runtime.device import find_device, memory_of
@@ -117,7 +117,10 @@ def filter_frames(
     Raises
     ------
     DataError
-        No frame counts, fewer frames than known flows, shapes that do not agree, or values that are not finite.
+        No frame counts, fewer frames than known flows, shapes that do not agree, or values that are not finite or on
+        another scale than 0 to 1.
+    ConfigurationError
+        ``dynamics`` or settings are of another kind.
 
     Examples
     --------
@@ -131,7 +134,9 @@ def filter_frames(
     >>> filtered.image.shape, len(filtered.gains)
     ((48, 48), 6)
     """
-    return finish(filter_steps(frames, reference, dynamics, params, flow_params, known_flows, runtime))
+    image = check_unit_image(reference, "reference")
+    checked = (None if each is None else check_unit_image(each, f"frame {index}") for index, each in enumerate(frames))
+    return finish(filter_steps(checked, image, dynamics, params, flow_params, known_flows, runtime))
 
 
 def filter_steps(
@@ -148,7 +153,8 @@ def filter_steps(
 
     ``start`` resumes from a checkpoint of the same frames and settings.
     """
-    params, flow_params = params or FilterParams(), flow_params or FlowParams()
+    params, flow_params = settings_of(FilterParams, params), settings_of(FlowParams, flow_params, "flow_params")
+    require_type("dynamics", dynamics, FlowDynamics, "identify(centroid.flows) finds them")
     image = check_image(reference, "reference")
     flows = _check_flows(image, dynamics, known_flows)
     stream = _checked(frames, image.shape)

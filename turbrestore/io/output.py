@@ -56,7 +56,7 @@ def check_output(
             if path.exists() and source.exists() and path.samefile(source):
                 raise OutputError(f"{path}: is the input {source}; choose another name")
         if path.exists() and not overwrite:
-            raise OutputError(f"{path}: exists already; choose another name or allow overwriting")
+            raise OutputError(f"{path}: exists already; choose another name or pass overwrite=True")
         if not os.access(folder, os.W_OK):
             raise OutputError(f"{path}: the folder {folder} is not writable")
     except OSError as error:

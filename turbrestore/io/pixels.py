@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import ROUNDING, FloatArray
+from ..core.arrays import ROUNDING, FloatArray, check_scale, not_finite
 from ..core.errors import DataError, require
 from ..core.remarks import Doubt
 
@@ -42,12 +42,12 @@ ORIENTATION_TAG = 274
 _ALTERNATING = 1.3
 
 
-def to_unit(pixels: PixelArray, full_scale: float, name: str) -> FloatArray:
+def to_unit(pixels: PixelArray, full_scale: float, name: str, remedy: str = "") -> FloatArray:
     """Convert the pixel values of a file to a new array of float32 intensities in [0, 1].
 
     Unsigned integers are divided by ``full_scale``. Floating point values up to 0.01 outside [0, 1] are clipped:
     rounding and resampling produce such values, while another scale (0 to 255, 0 to 4095) goes far beyond. ``name`` is
-    the array in messages.
+    the array in messages; ``remedy`` says what to do about values that are not finite.
     """
     pixels = np.asarray(pixels)
     if np.issubdtype(pixels.dtype, np.unsignedinteger):
@@ -58,12 +58,8 @@ def to_unit(pixels: PixelArray, full_scale: float, name: str) -> FloatArray:
         values = np.array(pixels, dtype=np.float32)
     lowest, highest = float(values.min()), float(values.max())
     if not (np.isfinite(lowest) and np.isfinite(highest)):
-        bad = int(values.size - np.count_nonzero(np.isfinite(values)))
-        raise DataError(f"{name}: expected finite values, found {bad} NaN or infinite ones")
-    if lowest < -FLOAT_MARGIN or highest > 1 + FLOAT_MARGIN:
-        raise DataError(
-            f"{name}: expected values in 0 to 1, found {lowest:.6g} to {highest:.6g}; divide them by full scale"
-        )
+        raise not_finite(values, name, remedy)
+    check_scale(lowest, highest, name, FLOAT_MARGIN)
     return np.clip(values, 0, 1, out=values)
 
 

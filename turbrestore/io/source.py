@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import operator
-import os
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import CHANNELS, FloatArray
+from ..core.arrays import CHANNELS, FloatArray, as_array
 from ..core.errors import ConfigurationError, DataError, require
 from ..core.remarks import Doubt, counted
 from ..runtime.scratch import iter_frames
@@ -178,7 +177,8 @@ class FrameSource:
         >>> float(FrameSource.from_array(np.zeros((1, 1, 1), np.uint8)).intensities(0, np.uint8([[255]]))[0, 0])
         1.0
         """
-        values = to_unit(pixels, self.full_scale, f"{self.name}: frame {number}")
+        remedy = "; clean_source(source, check_content(source)) fills them"
+        values = to_unit(pixels, self.full_scale, f"{self.name}: frame {number}", remedy)
         return values if self.adjust is None else self.adjust(number, values, self.window)
 
     def mosaics(self) -> Iterator[PixelArray | None]:
@@ -297,10 +297,9 @@ class FrameSource:
         >>> FrameSource.from_array(np.full((2, 1, 1), 255, np.uint8)).read().ravel()
         array([1., 1.], dtype=float32)
         """
-        if isinstance(array, str | os.PathLike):
-            raise DataError(f"{name}: expected numbers, found the path {array}; open it with turbrestore.open_frames")
         # What has a type of NumPy is indexed, and converted frame by frame.
-        values: Any = array if isinstance(getattr(array, "dtype", None), np.dtype) else np.asanyarray(array)
+        known = isinstance(getattr(array, "dtype", None), np.dtype)
+        values: Any = array if known else as_array(array, name, "turbrestore.open_frames")
         dtype = np.dtype(values.dtype)
         return FrameSource(
             name=name,

@@ -26,8 +26,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import ROUNDING, FloatArray, check_frames, luminance
-from ..core.errors import require, require_between
+from ..core.arrays import ROUNDING, FloatArray, check_frames, check_unit_frames, luminance
+from ..core.errors import require, require_between, settings_of
 from ..display.maps import plot_displacements
 from ..display.preview import preview
 from ..runtime.runtime import DEFAULT, Runtime
@@ -166,9 +166,9 @@ def find_centroid(
     Raises
     ------
     DataError
-        Fewer than two frames, wrong shapes or values that are not finite.
+        Fewer than two frames, wrong shapes, values that are not finite or on another scale than 0 to 1.
     ConfigurationError
-        ``start`` is not a frame.
+        ``start`` is not a frame, or settings are of another kind.
 
     Examples
     --------
@@ -179,7 +179,7 @@ def find_centroid(
     >>> centroid.converged, centroid.image.shape
     (True, (48, 48))
     """
-    return finish(centroid_steps(frames, params, flow_params, runtime))
+    return finish(centroid_steps(check_unit_frames(frames, at_least=2), params, flow_params, runtime))
 
 
 def centroid_steps(
@@ -189,7 +189,7 @@ def centroid_steps(
     runtime: Runtime = DEFAULT,
 ) -> Generator[CentroidState, None, Centroid]:
     """Iterate to the centroid of ``frames`` flow by flow."""
-    params, flow_params = params or CentroidParams(), flow_params or FlowParams()
+    params, flow_params = settings_of(CentroidParams, params), settings_of(FlowParams, flow_params, "flow_params")
     stack = check_frames(frames, at_least=2)
     require(params.start < len(stack), f"start: expected a frame below {len(stack)}, found {params.start}")
     if params.mode == "single":

@@ -34,8 +34,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import FloatArray, check_frames, check_grey, check_image, luminance
-from ..core.errors import DataError, require, require_between
+from ..core.arrays import FloatArray, check_grey, check_image, check_unit_frames, check_unit_image, luminance
+from ..core.errors import DataError, require, require_between, settings_of
 from ..core.noise import estimate_noise
 from ..runtime.device import CPU, find_device
 from ..runtime.runtime import DEFAULT, Runtime
@@ -149,7 +149,7 @@ def estimate_flow(
     Raises
     ------
     DataError
-        Shapes do not agree, an image is smaller than 16×16, or values are not finite.
+        Shapes do not agree, an image is smaller than 16×16, or values are not finite or on another scale than 0 to 1.
 
     Examples
     --------
@@ -162,8 +162,8 @@ def estimate_flow(
     >>> bool(abs(np.median(flow[..., 0]) - 0.7) < 0.05)
     True
     """
-    stack = check_frames(frames)
-    target = prepare_reference(reference, params, runtime)
+    stack = check_unit_frames(frames)
+    target = prepare_reference(check_unit_image(reference, "reference"), params, runtime)
     flows = new_stack((*stack.shape[:3], 2), runtime.scratch)
     for _ in fill_frames(flows, (flow for _, flow in measure_flows(target, iter_frames(stack)))):
         pass
@@ -209,7 +209,7 @@ def prepare_reference(
 
     Frames have at least the noise ``least_noise``, intensity: a single one does not tell smooth noise from detail.
     """
-    params = params or FlowParams()
+    params = settings_of(FlowParams, params)
     target = check_image(reference, "reference")
     if min(target.shape[:2]) < MIN_SIDE:
         raise DataError(

@@ -19,6 +19,7 @@ from itertools import chain
 import numpy as np
 
 from ..core.arrays import FloatArray
+from ..core.errors import settings_of
 from ..footage.frame_selection import frame_quality
 from ..io.source import FrameSource
 from ..preparation import prepare
@@ -99,7 +100,7 @@ def registered_frames(
     >>> len(registered), mean.shape
     (4, (32, 32))
     """
-    params = params or RestoreParams()
+    params = settings_of(RestoreParams, params)
     prepared = prepare(source, params.static_mask, runtime.scratch)
     filtered, count = restoration.filtered, len(source)
     unknown = np.full(count, np.nan)

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..blur.posterior import BlurWitnesses, blur_posterior, estimate_posterior, measure_witnesses
 from ..blur.psf import KOLMOGOROV
 from ..core.arrays import FloatArray, luminance
+from ..core.errors import settings_of
 from ..core.noise import estimate_noise
 from ..core.noise_spectrum import white_noise
 from ..footage.overlays import Title, find_title
@@ -114,7 +115,7 @@ def steady_frames(
     >>> [frame.number for frame in steady_frames(frames, SteadyParams(sigma=0))]
     [0, 1, 2]
     """
-    params = params or SteadyParams()
+    params = settings_of(SteadyParams, params)
     windows = iter_windows(frames, params.distances, params.later)
     if params.live:
         yield from _one_by_one(windows, params, runtime)

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray
 from ...core.decision import Decision
-from ...core.errors import ConfigurationError, DataError
+from ...core.errors import ConfigurationError, DataError, require_type, settings_of
 from ...core.remarks import Doubt, counted
 from ...io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
 from ...io.source import FrameSource, numbers_text
@@ -43,6 +43,8 @@ from .stuck_pixels import StuckPixelDetector, repair_stuck
 
 # Blank frames have at most this contrast or share of the median contrast; share of saturated pixels that is named.
 _LEAST_CONTRAST, _BLANK_CONTRAST, _SATURATED = 1 / 510, 0.1, 0.5
+# What to do with an array in place of a source.
+_OPENED = "use open_frames(path) or FrameSource.from_array(frames)"
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,8 @@ def check_content(source: FrameSource, params: ContentParams | None = None) -> C
     >>> report.duplicated, report.stuck.tolist()
     ((5,), [[8, 9]])
     """
-    params = params or ContentParams()
+    require_type("source", source, FrameSource, _OPENED)
+    params = settings_of(ContentParams, params)
     scan = _ContentScan(source)
     for number, pixels, mosaic in zip(source.numbers, source.native(), source.mosaics(), strict=True):
         scan.update(number, pixels, mosaic)
@@ -160,6 +163,8 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
     >>> bool(np.isfinite(cleaned.read()).all()), cleaned.warnings
     (True, ('1 NaN or infinite value in frame 1: filled from around',))
     """
+    require_type("source", source, FrameSource, _OPENED)
+    require_type("report", report, ContentReport, "check_content(source) makes one")
     if report.numbers != source.numbers:
         raise ConfigurationError(f"{source.name}: the report is about other frames; check this selection")
     cleaned = source.without(report.left_out, "")
