@@ -26,7 +26,7 @@ from turbrestore.core.arrays import FloatArray
 from turbrestore.metrics import compare
 
 # Releases, and the revisions that they were made from.
-RELEASES = {"0.1.0": "85ac0a9", "0.2.0": "a8c87a1", "0.3.0": "9d1ebf0", turbrestore.__version__: None}
+RELEASES = {"0.1.0": "85ac0a9", "0.2.0": "a8c87a1", "0.3.0": "698b073", turbrestore.__version__: None}
 # A command that prints its largest memory, MB, at its end.
 COMMAND = """import sys
 sys.path.append(sys.argv[1])
@@ -91,14 +91,14 @@ def restore(path: Path, tree: Path | None) -> tuple[FloatArray, float, float]:
 
 
 def document(releases: list[Release], mean: float) -> str:
-    """Markdown table, in which times and memory are relative to the first release."""
+    """Markdown table."""
     count, first = len(releases[0].psnr), releases[0]
     lines = [
         "# Releases",
         "",
         f"Made by `python benchmarks/history.py`: {count} drawn clips, restored by the command of each release with",
-        f"its defaults on one machine. The mean of the frames has {mean:.2f} dB. Time, with the start, and the largest",
-        "memory are means.",
+        f"its defaults on one machine. The mean of the frames has {mean:.2f} dB. Time, start included, and peak",
+        "memory are means over the clips.",
         "",
         "| release | mean PSNR, dB | least gain over 0.1.0, dB | time, s | memory, MB | lines of the package |",
         "|---|---|---|---|---|---|",

@@ -12,6 +12,7 @@ from cyclopts import Parameter
 
 from turbrestore.blind.guards import GuardParams, evaluate_guards
 from turbrestore.blind.remove_blur import SIGMAS_A_SIDE, remove_blur_steps
+from turbrestore.blur.estimation import BlurEstimate
 from turbrestore.blur.measured_psf import psf_from_image
 from turbrestore.blur.posterior import BlurPosterior
 from turbrestore.core.arrays import FloatArray, luminance
@@ -66,7 +67,7 @@ def deconvolve(
     ----------
     input : Path
         Image, stage file, or folder of a kept run.  Of a run the filtered image is deblurred, guided by the centroid,
-        by the width that the run removed.
+        by the width that the run measured and removed.
     output : Path
         Image (.png, .tif) or stage file (.npz) to write.  With --sweep a contact sheet, .png, by default sweep.png in
         the folder of the run.
@@ -109,8 +110,8 @@ def deconvolve(
     require(output is not None, "OUTPUT: expected an image or a stage file to write, found none")
     assert output is not None
     deconvolution = known_sigma(sigma, deconvolution)
-    asked = deconvolution
-    if input.is_dir() and psf is None and deconvolution.sigma is None:
+    of_run = input.is_dir() and psf is None and deconvolution.sigma is None
+    if of_run:
         deconvolution = _as_in_run(input, deconvolution)
     require(psf is None or deconvolution.sigma is None, "--psf: contradicts --sigma; leave one of them out")
     if bit_depth is not None:
@@ -128,8 +129,10 @@ def deconvolve(
         bit_depth = 16 if source.suffix.lower() in STAGE_FILE else read_image(source, limits).bit_depth
     write_stage(output, deblurred.deconvolution, bit_depth, overwrite)
     for decision in deblurred.decisions:
-        of_run = decision.subject == "blur" and deconvolution.sigma != asked.sigma
-        say(f"{output}: {replace(decision, reason='as much as the run removed') if of_run else decision}", quiet)
+        if of_run and decision.subject == "blur" and deconvolution.sigma is not None:
+            say(f"{output}: {replace(decision, reason='as much as the run removed')}", quiet)
+        else:
+            say(f"{output}: {decision}", quiet)
 
 
 def stage_of_run(path: Path) -> tuple[Path, Path | None]:
@@ -147,12 +150,17 @@ def stage_of_run(path: Path) -> tuple[Path, Path | None]:
 
 
 def _as_in_run(folder: Path, params: DeconvolutionParams) -> DeconvolutionParams:
-    """Complete settings by the blur that the run removed, if it measured one: it knows the frames as well."""
-    done, posterior = folder / "deconvolution.npz", folder / "posterior.npz"
-    if not (done.is_file() and posterior.is_file()):
+    """Complete settings by the blur that the run measured and removed: it knows the frames as well."""
+    posterior, blur = folder / "posterior.npz", folder / "blur.npz"
+    if posterior.is_file():
+        exponent = load_artifact(posterior, BlurPosterior).exponent
+    elif blur.is_file():
+        exponent = load_artifact(blur, BlurEstimate).exponent
+    else:
+        # The width or the point spread function was given.
         return params
-    exponent = params.exponent or load_artifact(posterior, BlurPosterior).exponent
-    return replace(params, sigma=load_artifact(done, Deconvolution).sigma, exponent=exponent)
+    removed = load_artifact(folder / "deconvolution.npz", Deconvolution).sigma
+    return replace(params, sigma=removed, exponent=params.exponent or exponent)
 
 
 def widths_of(sweep: str, shape: tuple[int, ...], name: str = "--sweep") -> tuple[float, ...]:

@@ -128,8 +128,8 @@ def evaluate(
     reference : Path
         Image of the same size, such as a frame or the temporal mean: sharpness and overshoot are measured against it.
     clip : Path
-        Video, to compare its temporal mean as well, where the result shows it.  What the result gained over the mean is
-        what the restoration did.
+        Video, to compare its temporal mean as well, cut to the part that the result shows.  What the result gained over
+        the mean is what the restoration did.
     max_pixels : int
         Largest image to read, pixels; by default 67 million.
     json : bool

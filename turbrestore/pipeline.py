@@ -267,7 +267,7 @@ def _remove_blur(
     if fused.filtered is not None:
         guide = recentre(guide, fused.filtered.mean_flow)
     found = None
-    if evidence.witnesses is not None:
+    if params.finds_blur:
         with run.timed("width"):
             found = find_blur(fused.image, params.deconvolution, plan.runtime, evidence.witnesses, evidence.noise)
     settings = params.deconvolution, params.guards, plan.runtime, plan.deconvolution_side

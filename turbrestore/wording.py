@@ -68,7 +68,7 @@ _CHECKS = {
     ),
     CheckKind.UNSEEN: ("{0} of the image is seen in hardly any frame", "--border crop"),
     CheckKind.NO_BLUR_REMOVED: (
-        "no blur is removed, although {0:.2f} pixels were to be: the guards against ringing and noise forbid it",
+        "no blur is removed, although {0:.2f} pixels should be: the guards against ringing and noise forbid it",
         "--sigma {0:.2f} removes it; ignore this if edges ring then",
     ),
     CheckKind.BLUR_LEFT: (

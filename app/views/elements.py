@@ -18,6 +18,7 @@ from ..job import one_line
 _LABELS = {
     "pass overwrite=True": "tick Replace existing files",
     "leave out --sigma": "press As measured",
+    "with --roi": "by Region",
     "--roi X,Y,WIDTH,HEIGHT of": "under Region, choose",
     "--roi X,Y,WIDTH,HEIGHT": "Region",
     "--frames FIRST:END with": "under Frames, choose",

@@ -137,7 +137,7 @@ class StackingView:
                     button.props(f'aria-label="{percent} %, suggested"')
                 for words in (str(one.frames), f"{one.noise:.2f}×", f"{one.sharpness:.2f}×", f"{one.worth:.2f}×"):
                     ui.label(words)
-        said = "The last row is suggested." if suggested else "All frames together are worth more than any share."
+        said = "The last row is suggested." if suggested else "No share is clearly worth more than all frames."
         named = [str(self._range[0] + int(place)) for place in found.order]
         self._named.text = (
             f"{said} Worth is detail over noise and error, all frames = 1. The sharpest frames are "

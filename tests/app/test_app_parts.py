@@ -278,8 +278,8 @@ def test_errors_name_the_fields_of_the_page():
     assert labelled("--frames: expected start:stop, found '1'") == "Frames: expected start:stop, found '1'"
     assert labelled("--roi: expected 4 numbers") == "Region: expected 4 numbers"
     # The page counts the last frame in.
-    assert labelled("--frames 0:9 shows one, --frames 9:20 the other") == (
-        "Frames 0 to 8 shows one, Frames 9 to 19 the other"
+    assert labelled("one is in --frames 0:9, the other in --frames 9:20") == (
+        "one is in Frames 0 to 8, the other in Frames 9 to 19"
     )
 
 

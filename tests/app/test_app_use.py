@@ -119,7 +119,7 @@ def test_frames_are_chosen_by_the_strip_and_the_line(open_tab):
     page.get_by_text("10 of 40 frames kept").wait_for()
     # None is suggested where all frames are worth as much.
     assert shares.get_by_role("button", name=re.compile("suggested")).count() == 0
-    page.get_by_text("All frames together are worth more than any share.").wait_for()
+    page.get_by_text("No share is clearly worth more than all frames.").wait_for()
 
 
 def test_a_clip_is_placed_on_another_result_and_made_finer(open_tab, app):

@@ -87,7 +87,7 @@ def of_another_type():
     ):
         yield Case([*words, option], (option.split("=")[0],))
     yield Case([*RESTORE, "--keep-best=thirty"], ("keep_best", "thirty"))
-    yield Case([*RESTORE, "--keep-best=30"], ("keep_best", "found 30; write 30%"))
+    yield Case([*RESTORE, "--keep-best=30"], ("keep_best", "found 30; write 0.3"))
     yield Case([*RESTORE, "--memory-limit=plenty"], ("memory_limit", "plenty"))
     yield Case([*RESTORE, "--memory-limit=2QB"], ("memory_limit", "2QB"))
 

@@ -20,6 +20,22 @@ OPENED = r"use open_frames\(path\) or FrameSource\.from_array\(frames\)"
 
 # Calls, and the lines that refuse them.
 WRONG = {
+    "path of frames to filter_frames": (
+        lambda: tr.filter_frames("clip.mkv", IMAGE, DYNAMICS),
+        r"frames: expected arrays .* found the path clip\.mkv; open it with turbrestore\.open_frames",
+    ),
+    "path of frames to steady_frames": (
+        lambda: next(tr.steady_frames("clip.mkv")),
+        r"frames: expected arrays \(H, W\) or \(H, W, 3\), found the path clip.mkv",
+    ),
+    "no frames to filter_frames": (
+        lambda: tr.filter_frames(None, IMAGE, DYNAMICS),
+        r"frames: expected arrays \(H, W\) or \(H, W, 3\), found NoneType",
+    ),
+    "array to registered_frames": (
+        lambda: next(iter(tr.registered_frames(FRAMES, tr.restore(FRAMES)))),
+        f"source: expected FrameSource, found ndarray; {OPENED}",
+    ),
     "frames of 255 to restore": (lambda: tr.restore(FRAMES * 255), f"array: frame 0: {RANGE}; {SCALE}"),
     "frames of 255 to find_centroid": (lambda: tr.find_centroid(FRAMES * 255), f"frames: {RANGE}; {SCALE}"),
     "frames of 255 to filter_frames": (
@@ -116,7 +132,7 @@ WRONG = {
     ),
     "share above 1": (
         lambda: tr.RestoreParams(keep_best=30),
-        "keep_best: expected a share above 0 and up to 1, or 1% to 100%, found 30; write 30%",
+        "keep_best: expected a share above 0 and up to 1, or 1% to 100%, found 30; write 0.3",
     ),
 }
 

@@ -30,7 +30,7 @@ def test_either_range_is_offered(frames, period, ranges):
     (decision,) = find_two_states(surveyed(with_sign(frames, np.arange(32) // period % 2))).decisions
     first, second = ranges.split()
     assert decision.check is CheckKind.TWO_STATES
-    assert decision.reason == f"--frames {first} shows one, --frames {second} the other"
+    assert decision.reason == f"one is in --frames {first}, the other in --frames {second}"
 
 
 def test_in_colour(frames):

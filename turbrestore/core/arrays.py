@@ -15,8 +15,8 @@ One sign rule holds everywhere: ``reference(x, y) ≈ frame(x + dx, y + dy)``.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterable, Iterator
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,7 @@ from .errors import DataError
 from .remarks import counted
 
 FloatArray = NDArray[np.float32]
+Frame = TypeVar("Frame")
 
 CHANNELS = (3,)
 # Rounding error of float32 at full scale: intensities that differ by less are the same.
@@ -153,6 +154,16 @@ def as_array(values: Any, name: str, reader: str) -> NDArray[Any]:
         held = next((f"; use its .{part}" for part in ("read()", "image") if hasattr(values, part.rstrip("()"))), "")
         raise DataError(found + held)
     return array
+
+
+def check_stream(frames: Iterable[Frame]) -> Iterable[Frame]:
+    """Return what gives frames one after the other; raise DataError for a path, and for what gives none."""
+    if isinstance(frames, str | os.PathLike):
+        found = f"the path {os.fspath(frames)}; open it with turbrestore.open_frames"
+        raise DataError(f"frames: expected arrays (H, W) or (H, W, 3), found {found}")
+    if not (hasattr(frames, "__iter__") or hasattr(frames, "__getitem__")):
+        raise DataError(f"frames: expected arrays (H, W) or (H, W, 3), found {type(frames).__name__}")
+    return frames
 
 
 def _on_unit_scale(array: FloatArray, name: str) -> FloatArray:

@@ -129,6 +129,8 @@ def identify(
     DataError
         Fewer than two flows, shapes that differ, values that are not finite, or an iterator that can be iterated
         only once.
+    ConfigurationError
+        Settings are of another type.
 
     Examples
     --------

@@ -45,7 +45,7 @@ from itertools import chain, islice, repeat
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import FloatArray, check_flow, check_image, check_unit_image
+from ..core.arrays import FloatArray, check_flow, check_image, check_stream, check_unit_image
 from ..core.errors import DataError, require_type, settings_of
 from ..dynamics.flow_model import FlowDynamics
 from ..registration.flow import FlowParams, iterate_flows
@@ -135,7 +135,8 @@ def filter_frames(
     ((48, 48), 6)
     """
     image = check_unit_image(reference, "reference")
-    checked = (None if each is None else check_unit_image(each, f"frame {index}") for index, each in enumerate(frames))
+    stream = enumerate(check_stream(frames))
+    checked = (None if each is None else check_unit_image(each, f"frame {index}") for index, each in stream)
     return finish(filter_steps(checked, image, dynamics, params, flow_params, known_flows, runtime))
 
 

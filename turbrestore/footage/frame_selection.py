@@ -57,5 +57,5 @@ def best_frames(quality: ArrayLike, share: float) -> np.ndarray:
 
 def check_share(share: float) -> None:
     """Raise ConfigurationError unless the fraction of frames to keep is above 0 and at most 1."""
-    percent = f"; write {share:g}%" if 2 <= share <= 100 else ""
+    percent = f"; write {share / 100:g}" if 2 <= share <= 100 else ""
     require(0 < share <= 1, f"keep_best: expected a share above 0 and up to 1, or 1% to 100%, found {share:g}{percent}")

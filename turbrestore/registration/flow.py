@@ -150,6 +150,8 @@ def estimate_flow(
     ------
     DataError
         Shapes do not agree, an image is smaller than 16×16, or values are not finite or on another scale than 0 to 1.
+    ConfigurationError
+        Settings are of another type.
 
     Examples
     --------

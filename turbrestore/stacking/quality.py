@@ -110,7 +110,7 @@ def quality_table(found: QualityList, numbers: Iterable[int]) -> str:
         f"{name:<10} {one.frames:>8} {one.noise:>6.2f}× {one.sharpness:>10.2f}× {one.worth:>6.2f}×"
         for name, one in rows
     ]
-    all_better = "no share is suggested, as all frames together are worth more"
+    all_better = "no share is suggested, as none is clearly worth more than all frames"
     lines += [f"worth: detail over noise and error; {all_better if found.suggested is None else '* suggested'}"]
     lines += ["restore weighs frames by itself", ""]
     top = float(found.quality.max()) or 1.0

@@ -19,7 +19,7 @@ from itertools import chain
 import numpy as np
 
 from ..core.arrays import FloatArray
-from ..core.errors import settings_of
+from ..core.errors import require_type, settings_of
 from ..footage.frame_selection import frame_quality
 from ..io.source import FrameSource
 from ..preparation import prepare
@@ -88,6 +88,8 @@ def registered_frames(
     ------
     DataError
         Frames cannot be read, or have another size than the restoration.
+    ConfigurationError
+        The source or the settings are of another type.
 
     Examples
     --------
@@ -101,6 +103,7 @@ def registered_frames(
     (4, (32, 32))
     """
     params = settings_of(RestoreParams, params)
+    require_type("source", source, FrameSource, "use open_frames(path) or FrameSource.from_array(frames)")
     prepared = prepare(source, params.static_mask, runtime.scratch)
     filtered, count = restoration.filtered, len(source)
     unknown = np.full(count, np.nan)

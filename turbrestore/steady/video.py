@@ -107,7 +107,9 @@ def steady_frames(
     Raises
     ------
     DataError
-        Frames differ in size or are smaller than 16×16, or values are not finite.
+        Frames differ in size or are smaller than 16×16, or values are not finite or on another scale than 0 to 1.
+    ConfigurationError
+        Settings are of another type.
 
     Examples
     --------

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..core.arrays import FloatArray, check_unit_image, luminance
+from ..core.arrays import FloatArray, check_stream, check_unit_image, luminance
 from ..core.errors import DataError
 from ..footage.checks.scene_cuts import similarity_at, thumbnail
 from ..registration.camera.global_shift import ShiftReference, prepare_shift_reference
@@ -149,7 +149,7 @@ def _window(kept: deque[WindowFrame], first: int, number: int, offsets: Sequence
 
 def _prepared(frames: Iterable[ArrayLike]) -> Iterator[WindowFrame]:
     scene, before, shape = 0, None, None
-    for number, values in enumerate(frames):
+    for number, values in enumerate(check_stream(frames)):
         image = check_unit_image(values, f"frame {number}")
         shape = shape or image.shape
         if image.shape != shape:

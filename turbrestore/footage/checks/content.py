@@ -121,6 +121,8 @@ def check_content(source: FrameSource, params: ContentParams | None = None) -> C
     ------
     DataError
         Damaged frames, too many values that are not finite, or, with ``params.strict``, any defect.
+    ConfigurationError
+        The source or the settings are of another type.
 
     Examples
     --------
@@ -152,7 +154,7 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
     Raises
     ------
     ConfigurationError
-        The report is about other frames.
+        The report is about other frames, or an argument is of another type.
 
     Examples
     --------

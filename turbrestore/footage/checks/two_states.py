@@ -72,4 +72,4 @@ def _in_words(numbers: NDArray[np.int64], second: NDArray[np.bool_], part: float
     longest = [max((run for run in runs if second[run[0]] == state), key=len) for state in (second[0], not second[0])]
     one, other = (f"--frames {numbers[run[0]]}:{numbers[run[-1]] + 1}" for run in longest)
     choice = f"{100 * part:.0f} % of the picture switches between them"
-    return Decision("two states", choice, f"{one} shows one, {other} the other", CheckKind.TWO_STATES)
+    return Decision("two states", choice, f"one is in {one}, the other in {other}", CheckKind.TWO_STATES)

@@ -90,7 +90,7 @@ def open_fits(path: str | os.PathLike[str], limits: Limits = DEFAULT_LIMITS, sin
         return _open_images(images, path, limits, f"its {len(images)} extensions of one size are taken for frames")
     image = images[0]
     frames = _as_frames(image, image.numbers(limits))
-    if frames.ndim == 3 and any(card.startswith(_IN_COLOUR) for card in image.cards):
+    if not single and frames.ndim == 3 and any(card.startswith(_IN_COLOUR) for card in image.cards):
         raise DataError(f"{path}: a single image in colour; name a video, or the folder that holds the frames")
     if single and frames.ndim == 2:
         frames = frames[None]
