@@ -107,7 +107,7 @@ class TestReading:
 
     def test_of_a_still_image_the_folder_is_asked_for(self, tmp_path, name):
         PIL.Image.fromarray(COLOUR[0]).save(tmp_path / name, format="WEBP" if name == "a.webp" else "PNG")
-        with pytest.raises(DataError, match="name the folder"):
+        with pytest.raises(DataError, match="or the folder that holds the frames"):
             open_frames(tmp_path / name)
 
     def test_other_content_is_refused(self, tmp_path, name):
