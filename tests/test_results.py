@@ -71,6 +71,10 @@ def test_every_doubt_is_named_once_with_a_remedy(restoration):
         CheckKind.UNSEEN: {"unseen": 0.04},
         CheckKind.NO_BLUR_REMOVED: {"deconvolution": none, "posterior": widths(restoration, 0.6, 0.9, 1.2)},
         CheckKind.BLUR_LEFT: {"posterior": widths(restoration, 1.5 * removed, 2.5 * removed, 3 * removed)},
+        CheckKind.LESS_THAN_MEASURED: {
+            "deconvolution": none,
+            "posterior": replace(widths(restoration, 0.6, 0.9, 1.2), removed=0.0),
+        },
         CheckKind.BLUR_UNKNOWN: {"blur": replace(restoration.blur, uncertainty=math.inf)},
         CheckKind.TOO_SHARP: {"guard_readings": (replace(reading, passed=False),)},
     }  # fmt: skip
@@ -97,8 +101,8 @@ def test_a_remedy_names_the_width_that_the_guards_took_back(restoration, sigma, 
     assert check.remedy.startswith("--sigma 0.70 ")
 
 
-def test_a_blur_whose_removal_would_not_be_seen_is_no_doubt(restoration):
-    posterior = replace(widths(restoration, 0.61, 0.93, 1.2), removed=0.0)
+def test_a_blur_of_pixels_alone_is_no_doubt(restoration):
+    posterior = replace(widths(restoration, 0.2, 0.35, 0.6), removed=0.0)
     changed = replace(restoration, deconvolution=replace(restoration.deconvolution, sigma=0.0), posterior=posterior)
     assert changed.verdict.checks == ()
 

@@ -265,10 +265,13 @@ def _checks_of_blur(restoration: Restoration) -> Iterator[Check]:
     if restoration.blur is not None and not math.isfinite(restoration.blur.uncertainty):
         yield write_check(CheckKind.BLUR_UNKNOWN)
         return
-    # Nothing is wrong where removing a blur would not be seen to help: such clips are bad no more often than others.
-    decided = float(restoration.posterior.removed)
+    decided, (low, width, high) = float(restoration.posterior.removed), map(float, restoration.posterior.width)
+    # A pixel and one interpolation blur by a box of one pixel each.
+    is_seen = width > 1 / math.sqrt(6)
     if removed < _HALF * decided:
         yield write_check(CheckKind.BLUR_LEFT if removed > 0 else CheckKind.NO_BLUR_REMOVED, decided, removed)
+    elif is_seen and removed < min(low, _HALF * width):
+        yield write_check(CheckKind.LESS_THAN_MEASURED, width, low, high)
 
 
 def _is_too_sharp(restoration: Restoration) -> bool:

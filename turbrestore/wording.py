@@ -75,6 +75,11 @@ _CHECKS = {
         "{1:.2f} of {0:.2f} pixels of blur are removed: the guards against ringing and noise forbid more",
         "--sigma {0:.2f} removes all; ignore this if edges ring then",
     ),
+    CheckKind.LESS_THAN_MEASURED: (
+        "{0:.2f} pixels of blur were measured ({1:.2f} to {2:.2f}), and less or none is removed: more is not expected "
+        "to improve the image",
+        "--sigma {0:.2f} shows whether it does",
+    ),
     CheckKind.BLUR_UNKNOWN: (
         "the width of the blur could not be measured, and none is removed",
         "--sigma 1 removes a usual one",

@@ -33,6 +33,7 @@ class CheckKind(StrEnum):
     UNSEEN = "unseen"
     NO_BLUR_REMOVED = "no blur removed"
     BLUR_LEFT = "blur left"
+    LESS_THAN_MEASURED = "less than measured"
     BLUR_UNKNOWN = "blur unknown"
     TOO_SHARP = "too sharp"
     DRIFT = "drift"  # of a steadied video
