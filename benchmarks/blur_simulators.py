@@ -24,6 +24,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from blur_clips import h264
+from numpy.typing import NDArray
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.registration.flow_algebra import invert_flow
@@ -48,18 +49,21 @@ SCENES = {"leaves": 0.35, "text": 0.13, "bars": 0.05, "craters": 0.12, "photogra
 SHARES = {"screens": 0.27, "kernels": 0.18, "lens": 0.17, "mixed": 0.13, "near": 0.07, "none": 0.13, "close": 0.05}
 # Pixels around a clip from which displacement brings in what the frame does not show at rest.
 MARGIN = 32
+# Rows and columns around a pixel of a title, which is sharp, within which the removal of a blur makes rings.
+AROUND_TITLE = (25, 25)
 # Widths of the stack of blurred scenes that ``mixed`` interpolates.
 STACK = np.array([0.0, 0.4, 0.7, 1.0, 1.4, 1.9, 2.5, 3.2, 4.1, 5.2, 6.6, 8.2, 10.0])
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedClip:
-    """Frames (T, H, W) and the scene (H, W) in their mean geometry."""
+    """Frames (T, H, W), the scene (H, W) in their mean geometry, and where a title and its surroundings hide it."""
 
     simulator: str
     scene: str
     frames: FloatArray
     truth: FloatArray
+    hidden: NDArray[np.bool_]
 
 
 def simulate(seed: int, simulator: str | None = None) -> SimulatedClip:
@@ -72,10 +76,12 @@ def simulate(seed: int, simulator: str | None = None) -> SimulatedClip:
     scene = draw_scene(name, side + 2 * MARGIN, rng)
     count = int(np.exp(rng.uniform(np.log(4), np.log(100))))
     frames, truth = _SIMULATORS[simulator](scene, count, rng)
+    bare = truth.copy()
     if rng.uniform() < 0.1:
         _burn_in_title([*frames, truth], rng)
+    hidden = cv2.dilate(np.uint8(truth != bare), np.ones(AROUND_TITLE, np.uint8)).astype(bool)
     camera = smoothly_noisy if rng.uniform() < 0.12 else record
-    return SimulatedClip(simulator, name, camera(frames, rng), truth)
+    return SimulatedClip(simulator, name, camera(frames, rng), truth, hidden)
 
 
 def draw_scene(name: str, side: int, rng: np.random.Generator) -> FloatArray:

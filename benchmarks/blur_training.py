@@ -21,6 +21,7 @@ from itertools import pairwise
 from pathlib import Path
 from unittest.mock import patch
 
+import cv2
 import numpy as np
 import torch
 from blur_calibration import CORE, registered
@@ -30,7 +31,7 @@ from provenance import publish
 from turbrestore import DeconvolutionParams, TurbrestoreError, pipeline
 from turbrestore.blind import remove_blur
 from turbrestore.blur import posterior
-from turbrestore.blur.learnt import EXPONENTS, FACTORS, FARTHEST, LOG_SPREADS, LearntBlur, blur_features, learnt_blur
+from turbrestore.blur.learnt import FACTORS, FARTHEST, LOG_SPREADS, LearntBlur, blur_features, learnt_blur
 from turbrestore.blur.psf import radial_otf
 from turbrestore.blur.witnesses.spectral_variation import RINGS, SIDE
 from turbrestore.core.arrays import FloatArray
@@ -39,20 +40,24 @@ from turbrestore.deconvolution.deconvolve import deconvolve
 from turbrestore.runtime.runtime import Runtime
 
 WEIGHTS = Path(__file__).resolve().parent.parent / "turbrestore" / "blur" / "learnt_blur.npz"
-# Mean squared error that is invisible, decibels below which a loss is as bad as any other, and unit of the networks.
-INVISIBLE, WORST, UNIT = 10**-3.8, -8.0, 3.0
-# Widths that are removed, pixels.
+# Mean squared error that is invisible; decibels below which losses are alike, and alike for the networks, which are to
+# tell the best widths apart and not the worst; and unit of the networks.
+INVISIBLE, WORST, HARMFUL, UNIT = 10**-3.8, -8.0, -4.0, 3.0
+# Exponents and widths, pixels, that are removed.
+EXPONENTS = (1.3, 1.65, 2.0)
 WIDTHS = np.array([0, 0.35, 0.5, 0.7, 0.95, 1.25, 1.65, 2.2, 2.9, 3.9, 5.4, 7.5, 10.0])
 # Iterations that tell which blur is best; and a loss after which wider blurs are not tried, as a ratio of errors.
 ITERATIONS, HOPELESS = 8, 4.0
+# Width of the transition around a title, pixels.
+FADED = 5.0
 # A blur that is wider than the widest by this factor is taken for hopeless.
 BEYOND = 1.5
-# Place of the width of the posterior among the features.
-USUAL = 10
+# Places of the quantiles of the posterior and of its exponent among the features.
+POSTERIOR, SHAPE = slice(9, 12), 13
 # Networks, their inner width, epochs, size of a batch, rate, decay of the weights, and share of units that are dropped.
 NETWORKS, INNER, EPOCHS, BATCH, RATE, DECAY, DROPPED = 10, 48, 14, 128, 3e-3, 0.3, 0.3
 # Copies of a clip relative to other widths; deviation of the logarithm of these about the right one and the usual one.
-COPIES, NEARBY, FAR = 5, 0.3, 0.5
+COPIES, NEARBY, FAR = 9, 0.3, 0.5
 
 
 class _ReachedError(Exception):
@@ -123,12 +128,22 @@ def known_of(clip: SimulatedClip) -> dict[str, object]:
         return {"refused": "no blur is looked for"}
     image = known.pop("image")
     truth = registered(known.pop("levels").stretched(clip.truth), image)
-    (width, exponent), errors = fitted_blur(image, truth), errors_of(image, truth, known["noise"])
+    width, exponent = fitted_blur(*(without_title(one, clip.hidden) for one in (image, truth)))
+    errors = errors_of(image, truth, known["noise"], ~clip.hidden[CORE])
     return {"features": known["features"], "width": width, "exponent": exponent, "errors": errors}
 
 
-def errors_of(image: FloatArray, truth: FloatArray, noise: NoiseSpectrum) -> FloatArray:
-    """Mean squared errors (exponents, widths) of the image without every blur of the grid; NaN where hopeless."""
+def without_title(image: FloatArray, hidden: np.ndarray) -> FloatArray:
+    """Fade an image (H, W) to its mean where a title hides it."""
+    share = np.maximum(cv2.GaussianBlur(np.float32(hidden), (0, 0), FADED), hidden)
+    return image + share * (image[~hidden].mean() - image)
+
+
+def errors_of(image: FloatArray, truth: FloatArray, noise: NoiseSpectrum, seen: np.ndarray) -> FloatArray:
+    """Mean squared errors (exponents, widths) of the image without every blur of the grid; NaN where hopeless.
+
+    Pixels of the core that are not ``seen`` do not count: a title is sharp, so that it rings whatever is removed.
+    """
     errors = np.full((len(EXPONENTS), len(WIDTHS)), np.nan)
     for row, exponent in zip(errors, EXPONENTS, strict=True):
         params = DeconvolutionParams(exponent=exponent, iterations=ITERATIONS)
@@ -136,7 +151,7 @@ def errors_of(image: FloatArray, truth: FloatArray, noise: NoiseSpectrum) -> Flo
             if width * remove_blur.SIGMAS_A_SIDE > min(image.shape):
                 break
             result = deconvolve(image, width, params, runtime=Runtime(threads=1), noise=noise).image
-            row[place] = np.mean(np.square(np.clip(result[CORE], 0, 1) - truth[CORE]))
+            row[place] = np.mean(np.square(np.clip(result[CORE], 0, 1) - truth[CORE])[seen])
             if row[place] > max(HOPELESS * np.nanmin(row), INVISIBLE):
                 break
     return errors
@@ -168,14 +183,19 @@ def fitted_blur(image: FloatArray, truth: FloatArray) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class TrainingClips:
-    """Features (n, f), width, that of the posterior, and exponent (n), and gains in visible error, dB (n, e, w)."""
+    """Features (n, f), width and exponent (n), gains in visible error, dB, (n, e, w), and by the posterior's shape."""
 
     simulators: np.ndarray
     features: np.ndarray
     width: np.ndarray
-    usual: np.ndarray
     exponent: np.ndarray
+    every_gain: np.ndarray
     gains: np.ndarray
+
+    @property
+    def posterior(self) -> np.ndarray:
+        """Quantiles of the posterior (n, 3), pixels."""
+        return np.exp(self.features[:, POSTERIOR])
 
 
 def read_clips(folder: Path) -> TrainingClips:
@@ -183,20 +203,21 @@ def read_clips(folder: Path) -> TrainingClips:
     held = [pickle.loads(path.read_bytes()) for path in sorted(folder.glob("*.pkl"))]
     held = [clip for clip in held if "errors" in clip]
     visible = -10 * np.log10(np.array([clip["errors"] for clip in held]) + INVISIBLE)
-    gains = np.nan_to_num(visible - visible[..., :1], nan=WORST)
+    gains = np.maximum(np.nan_to_num(visible - visible[..., :1], nan=WORST), WORST)
+    features = np.array([clip["features"] for clip in held])
     return TrainingClips(
         np.array([clip["simulator"] for clip in held]),
-        np.array([clip["features"] for clip in held]),
+        features,
         np.maximum([clip["width"] for clip in held], WIDTHS[1]),
-        np.exp([clip["features"][USUAL] for clip in held]),
         np.array([clip["exponent"] for clip in held]),
-        np.maximum(gains, WORST),
+        gains,
+        np.array([_with_exponent(one, shape) for one, shape in zip(gains, features[:, SHAPE], strict=True)]),
     )
 
 
 def train_networks(clips: TrainingClips, chosen: np.ndarray) -> dict[str, np.ndarray]:
     """Train networks on some clips, and return their weights and the scale of the features."""
-    features, usual = clips.features[chosen], clips.usual[chosen]
+    features, usual = clips.features[chosen], clips.posterior[chosen, 1]
     low, middle, high = np.nanquantile(features, (0.02, 0.5, 0.98), axis=0)
     scale = np.maximum((high - low) / 4, 1e-3)
     standard = np.clip(np.nan_to_num((features - middle) / scale), -FARTHEST, FARTHEST)
@@ -209,11 +230,11 @@ def train_networks(clips: TrainingClips, chosen: np.ndarray) -> dict[str, np.nda
         wider = rng.standard_normal(len(usual)) * (NEARBY if copy % 2 else FAR) + (right if copy % 2 else 0)
         wider *= copy > 0
         grid = [
-            _gains_at(gains, width * FACTORS).ravel()
+            np.maximum(_gains_at(gains, width * FACTORS), HARMFUL)
             for gains, width in zip(clips.gains[chosen], usual * np.exp(wider), strict=True)
         ]
         x.append(np.column_stack([standard, np.clip(wider / FAR, -FARTHEST, FARTHEST)]))
-        y.append(np.column_stack([right - wider, clips.exponent[chosen], np.array(grid) / UNIT]))
+        y.append(np.column_stack([right - wider, np.array(grid) / UNIT]))
     inputs, targets = (torch.tensor(np.concatenate(part), dtype=torch.float32) for part in (x, y))
     layers: dict[str, list[np.ndarray]] = {f"{kind}{layer}": [] for layer in (1, 2, 3) for kind in "wb"}
     for member in range(NETWORKS):
@@ -224,7 +245,7 @@ def train_networks(clips: TrainingClips, chosen: np.ndarray) -> dict[str, np.nda
     weights = {"middle": middle, "scale": scale, **{name: np.array(values) for name, values in layers.items()}}
     weights["w1"] = weights["w1"][..., :-1]
     for name in ("w3", "b3"):
-        weights[name][:, 3:] *= UNIT
+        weights[name][:, 2:] *= UNIT
     return weights
 
 
@@ -241,11 +262,10 @@ def _train_one(x: torch.Tensor, y: torch.Tensor, seed: int) -> torch.nn.Sequenti
     for _ in range(EPOCHS):
         for batch in torch.randperm(len(x)).split(BATCH):
             out = network(x[batch] + 0.05 * torch.randn_like(x[batch]))
-            width, exponent, gains = y[batch, 0], y[batch, 1], y[batch, 2:]
+            width, gains = y[batch, 0], y[batch, 1:]
             log = out[:, 1].clamp(*LOG_SPREADS)
             likelihood = (0.5 * torch.square((width - out[:, 0]) / log.exp()) + log).mean()
-            loss = torch.square(out[:, 3:] - gains).mean() + 0.1 * likelihood
-            loss = loss + 0.1 * torch.square(out[:, 2] - exponent).mean()
+            loss = torch.square(out[:, 2:] - gains).mean() + 0.1 * likelihood
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
@@ -274,7 +294,7 @@ def table_of(clips: TrainingClips) -> str:
         held = clips.simulators == name
         weights = train_networks(clips, ~held)
         found |= {
-            place: learnt_blur(clips.features[place], clips.usual[place], weights) for place in np.flatnonzero(held)
+            place: learnt_blur(clips.features[place], clips.posterior[place], weights) for place in np.flatnonzero(held)
         }
         lines.append(_row(name, clips, held, found))
     every = np.ones(len(folds), bool)
@@ -283,7 +303,7 @@ def table_of(clips: TrainingClips) -> str:
     for fold in range(5):
         weights = train_networks(clips, folds != fold)
         found |= {
-            place: learnt_blur(clips.features[place], clips.usual[place], weights)
+            place: learnt_blur(clips.features[place], clips.posterior[place], weights)
             for place in np.flatnonzero(folds == fold)
         }
     for name in sorted(set(clips.simulators)):
@@ -298,34 +318,31 @@ def _row(title: str, clips: TrainingClips, held: np.ndarray, found: dict[int, Le
     true, wide = np.log(clips.width[places]), clips.width[places] > 0.6
     error = (quantiles[:, 1] - true)[wide]
     within = ((true >= quantiles[:, 0]) & (true <= quantiles[:, 2])).mean()
-    gains = clips.gains[places]
-    removed = np.array(
-        [
-            _gain(gain, found[place].removed, found[place].removed_exponent)
-            for gain, place in zip(gains, places, strict=True)
-        ]
-    )
-    right = [_gain(gain, clips.width[place], clips.exponent[place]) for gain, place in zip(gains, places, strict=True)]
+    removed = np.array([_gains_at(clips.gains[place], np.array([found[place].removed]))[0] for place in places])
+    right = [
+        _gains_at(_with_exponent(clips.every_gain[place], clips.exponent[place]), clips.width[place, None])[0]
+        for place in places
+    ]
+    best = clips.every_gain[places].max((1, 2)).mean()
     size = np.abs(error) if error.size else np.array([np.nan])
     return (
         f"| {title} | {len(places)} | {np.median(error) if error.size else np.nan:+.2f}, {np.median(size):.2f}, "
-        f"{np.quantile(size, 0.9):.2f} | {within:.0%} | {gains.max((1, 2)).mean():.2f} | {np.mean(right):.2f} | "
+        f"{np.quantile(size, 0.9):.2f} | {within:.0%} | {best:.2f} | {np.mean(right):.2f} | "
         f"{removed.mean():.2f} | {(removed < -0.2).mean():.0%} |"
     )
 
 
 def _gains_at(gains: np.ndarray, widths: np.ndarray) -> np.ndarray:
-    """Gains (exponents, widths) on the grid of WIDTHS at other widths; those of a narrow blur grow as its square."""
+    """Gains on the grid of WIDTHS at other widths; those of a narrow blur grow as its square."""
     logs, known = np.log(np.maximum(widths, WIDTHS[1])), np.log([*WIDTHS[1:], BEYOND * WIDTHS[-1]])
-    narrow = np.minimum(np.square(widths / WIDTHS[1]), 1)
-    return np.array([narrow * np.interp(logs, known, [*row[1:], WORST]) for row in gains])
+    return np.minimum(np.square(widths / WIDTHS[1]), 1) * np.interp(logs, known, [*gains[1:], WORST])
 
 
-def _gain(gains: np.ndarray, width: float, exponent: float) -> float:
-    """Gain by removing one blur, from the gains on the grid (exponents, widths)."""
-    share = np.clip((exponent - EXPONENTS[0]) / (EXPONENTS[1] - EXPONENTS[0]), 0, 1)
-    low, high = _gains_at(gains, np.array([width]))[:, 0]
-    return float((1 - share) * low + share * high)
+def _with_exponent(gains: np.ndarray, exponent: float) -> np.ndarray:
+    """Gains (exponents, widths) for another exponent (widths)."""
+    place = float(np.interp(exponent, EXPONENTS, np.arange(len(EXPONENTS))))
+    low = min(int(place), len(EXPONENTS) - 2)
+    return (1 - place + low) * gains[low] + (place - low) * gains[low + 1]
 
 
 if __name__ == "__main__":

@@ -5,15 +5,18 @@ Symbols
 x : what the witnesses say, standardised: widths by every witness and by their posterior, s and s_4, the spectrum of the
     image, that of its noise, the ratio to that of the mean of the frames, and costs of the image
 σ, p : width and exponent of the transfer function of the image; see :func:`turbrestore.blur.psf.blur_otf`
-G : gain, decibels, by which the visible error ``e² + e_0²`` falls where a blur (σ, p) is removed; e² is the mean
-    squared error, and e_0² that of 38 dB, below which no error is seen
+σ_16 : width that is exceeded with a probability of 84 % by the posterior
+G : gain, decibels, by which the visible error ``e² + e_0²`` falls where a blur of some width is removed, whose exponent
+    is that of the posterior; e² is the mean squared error, and e_0² that of 38 dB, below which no error is seen
 
-A few small networks, trained alike from different starts, map x to ln σ with its deviation, to p and to G on a grid of
-widths for two exponents; widths are relative to that of the posterior, which is about right at every scale.  Their mean
-counts, and their scatter adds to the deviation.  Of the blurs whose G is as good as the largest, but for a difference
-that is not seen, the widest is removed that is no wider than σ or than the best; none is, where all of G is too small
-to be seen.  So it is no wider than the noise allows, and narrower than σ where that is doubtful and too wide a blur
-would cost more than too narrow a one.
+A few small networks, trained alike from different starts, map x to ln σ with its deviation, and to G on a grid of
+widths; widths are relative to that of the posterior, which is about right at every scale.  Their mean counts, and their
+scatter adds to the deviation.  Of the widths whose G is as good as the largest, but for a difference that is not seen,
+the widest is chosen that is no wider than σ or than the best.
+
+What is removed is the geometric mean of that width and σ_16, or nothing where G expects a loss from it.  The networks
+know more simulators than the theory of the posterior, and are wrong where a clip is like none of them; the posterior
+errs elsewhere.  Clips that neither was made on are restored better with the mean than with either alone.
 
 ``python benchmarks/blur_training.py`` makes the clips, trains and judges the networks, and writes ``learnt_blur.npz``.
 """
@@ -34,17 +37,15 @@ from .psf import Float64Array
 from .witnesses.image_evidence import ImageEvidence
 from .witnesses.spectral_variation import RINGS, SIDE, SpectralVariation, window_power
 
-# Grid of G: widths relative to that of the posterior, the first of which is no blur, and exponents.
+# Grid of G: widths relative to that of the posterior, the first of which is no blur.
 FACTORS: Float64Array = np.array([0, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.35, 1.6, 2.0, 2.6])
-EXPONENTS = (1.3, 2.0)
 # Rings whose values are read, and widths at which costs of the image are read, pixels.
 _PICKED = np.array([1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20, 24, 28])
 _COSTS: Float64Array = np.geomspace(0.3, 9, 14)
 # Costs of a gradient above this are all the same, and so many gradients make a unit.
 _DEAREST, _GRADIENTS = 20.0, 40.0
-# Decibels below which a gain is not seen, as in the tables of the benchmarks; by which a wider blur may gain less; and
-# number of factors that are tried.
-_SEEN, _ALIKE, _TRIED = 0.2, 0.1, 200
+# Decibels by which a wider blur may gain less, and number of factors that are tried.
+_ALIKE, _TRIED = 0.05, 200
 # Least and largest logarithm of the deviation that a network is trained to say.
 LOG_SPREADS = (-3.0, 1.0)
 # Standardised values beyond this were hardly seen in training.
@@ -58,10 +59,7 @@ class LearntBlur:
     """What the networks say about the blur of an image."""
 
     width: Float64Array  # (3,): 16 %, 50 % and 84 % quantiles of the width, pixels
-    exponent: float  # of the transfer function
-    # Width, pixels, and exponent of the blur to remove; width 0 and the exponent above if none gains.
-    removed: float
-    removed_exponent: float
+    removed: float  # width of the blur to remove, pixels; 0 if none gains
 
 
 def blur_features(
@@ -113,15 +111,9 @@ def blur_features(
 
 
 def learnt_blur(
-    features: Float64Array,
-    width: float,
-    weights: Mapping[str, NDArray[np.floating]] | None = None,
-    exponent: float | None = None,
+    features: Float64Array, widths: Float64Array, weights: Mapping[str, NDArray[np.floating]] | None = None
 ) -> LearntBlur:
-    """Evaluate the networks of the package, or others, where the posterior has a width in pixels.
-
-    An ``exponent`` that is given is the only one that may be removed.
-    """
+    """Evaluate the networks of the package, or others; ``widths`` (3,) are the quantiles of the posterior, pixels."""
     weights = _weights() if weights is None else weights
     # What is not known is taken for usual.
     x = np.clip(np.nan_to_num((features - weights["middle"]) / weights["scale"]), -FARTHEST, FARTHEST)
@@ -131,18 +123,12 @@ def learnt_blur(
         x = x / (1 + np.exp(-x))
     out = np.einsum("nij,nj->ni", weights["w3"], x) + weights["b3"]
     spread = float(np.sqrt(np.mean(np.exp(2 * np.clip(out[:, 1], *LOG_SPREADS))) + out[:, 0].var()))
-    quantiles = width * np.exp(out[:, 0].mean() + spread * np.array([-1.0, 0.0, 1.0]))
-    gains = out[:, 3:].mean(axis=0).reshape(len(EXPONENTS), -1)
-    gains = gains - gains[:, :1]
-    exponents, likeliest = tuple[float, ...](EXPONENTS), float(np.clip(out[:, 2].mean(), 1, 2))
-    if exponent is not None:
-        share = np.clip((exponent - EXPONENTS[0]) / (EXPONENTS[1] - EXPONENTS[0]), 0, 1)
-        gains, exponents, likeliest = np.array([1 - share, share])[None] @ gains, (exponent,), exponent
-    best = int(gains.max(axis=1).argmax())
-    if gains[best].max() <= _SEEN:
-        return LearntBlur(quantiles, likeliest, 0.0, likeliest)
-    removed = width * _widest(gains[best], float(quantiles[1]) / width)
-    return LearntBlur(quantiles, likeliest, removed, exponents[best])
+    low, usual = float(widths[0]), float(widths[1])
+    quantiles = usual * np.exp(out[:, 0].mean() + spread * np.array([-1.0, 0.0, 1.0]))
+    gains = out[:, 2:].mean(axis=0)
+    gains = gains - gains[0]
+    removed = (usual * _widest(gains, float(quantiles[1]) / usual) * low) ** 0.5
+    return LearntBlur(quantiles, removed if np.interp(removed / usual, FACTORS, gains) >= 0 else 0.0)
 
 
 def _widest(gains: Float64Array, most: float) -> float:
@@ -150,7 +136,8 @@ def _widest(gains: Float64Array, most: float) -> float:
     tried = np.linspace(FACTORS[1], FACTORS[-1], _TRIED)
     found = np.interp(tried, FACTORS, gains)
     most = max(most, float(tried[found.argmax()]))
-    return float(tried[(found >= found.max() - _ALIKE) & (tried <= most)].max())
+    good = tried[(found >= gains.max() - _ALIKE) & (tried <= most)]
+    return float(good.max()) if good.size else 0.0
 
 
 def _spectrum(image: FloatArray) -> Float64Array:

@@ -139,8 +139,8 @@ def estimate_posterior(
     widths = [by_theory.by_displacement, by_theory.by_variation, by_theory.by_image, by_theory.width]
     facts = by_theory.air, by_theory.exponent, witnesses.displacement, witnesses.independent_frames
     features = blur_features(image, np.array(widths), variation, ratio, evidence, noise, facts)
-    found = learnt_blur(features, float(by_theory.width[1]), exponent=exponent)
-    return evidence, replace(by_theory, removed=found.removed, exponent=found.removed_exponent, width=found.width)
+    found, shape = learnt_blur(features, by_theory.width), exponent or by_theory.exponent
+    return evidence, replace(by_theory, removed=found.removed, exponent=shape, width=found.width)
 
 
 def blur_posterior(
