@@ -1,8 +1,8 @@
 """Clips that benchmarks restore: the project's own synthetic ones, and stored ones where there are any.
 
 Settings of the package were chosen on some of them.  Clips called ``drawn_…`` are judged on: they show scenes that no
-other clip shows, and everything about them is drawn from a seed that is the version and the number of the draw, so that a
-release has clips that nobody has seen before.
+other clip shows, and everything about them is drawn from the version and the number of the draw, so that a release has
+clips that nobody has seen before.
 
 Stored clips lie under the folder that ``TURBRESTORE_DATA`` names: ``simulated/NAME/clip.*`` with ``truth.png``, and
 ``real/NAME/clip.*`` with ``words.txt`` where the text is known and ``peer_*.png`` where other methods' results are.
