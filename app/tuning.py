@@ -63,7 +63,8 @@ def tuned_params(restored: Restored) -> DeconvolutionParams:
     DeconvolutionParams
     """
     params, found = restored.order.params.deconvolution, restored.restoration
-    exponent = params.exponent if found.blur is None else found.blur.exponent
+    blur = found.posterior or found.blur
+    exponent = params.exponent or (None if blur is None else blur.exponent)
     sigma = 0.0 if found.deconvolution is None else found.deconvolution.sigma
     return dataclasses.replace(params, sigma=round(float(sigma), 3), exponent=exponent)
 

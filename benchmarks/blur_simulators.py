@@ -1,4 +1,4 @@
-"""Simulated clips of known blur from which the width of a blur is learnt: four simulators, and clips without any blur.
+"""Simulated clips from which the width of a blur is learnt, by six simulators of blur and one of none.
 
 ``screens``   anisoplanatic phase screens of random strength, diffraction, outer scale, path and wind
 ``kernels``   weighted sums of a few random speckled kernels, whose weights change from place to place and in time
@@ -49,7 +49,7 @@ SCENES = {"leaves": 0.35, "text": 0.13, "bars": 0.05, "craters": 0.12, "photogra
 SHARES = {"screens": 0.27, "kernels": 0.18, "lens": 0.17, "mixed": 0.13, "near": 0.07, "none": 0.13, "close": 0.05}
 # Pixels around a clip from which displacement brings in what the frame does not show at rest.
 MARGIN = 32
-# Rows and columns around a pixel of a title, which is sharp, within which the removal of a blur makes rings.
+# Sides of the rectangle around each pixel of a title within which most rings are that the removal of a blur makes.
 AROUND_TITLE = (25, 25)
 # Widths of the stack of blurred scenes that ``mixed`` interpolates.
 STACK = np.array([0.0, 0.4, 0.7, 1.0, 1.4, 1.9, 2.5, 3.2, 4.1, 5.2, 6.6, 8.2, 10.0])

@@ -40,15 +40,15 @@ from turbrestore.deconvolution.deconvolve import deconvolve
 from turbrestore.runtime.runtime import Runtime
 
 WEIGHTS = Path(__file__).resolve().parent.parent / "turbrestore" / "blur" / "learnt_blur.npz"
-# Mean squared error that is invisible; decibels below which losses are alike, and alike for the networks, which are to
-# tell the best widths apart and not the worst; and unit of the networks.
+# Mean squared error that is invisible; gains, dB, below which all losses count alike in the table, and in training,
+# where the best widths are to be told apart and not the worst; unit of the networks, dB.
 INVISIBLE, WORST, HARMFUL, UNIT = 10**-3.8, -8.0, -4.0, 3.0
 # Exponents and widths, pixels, that are removed.
 EXPONENTS = (1.3, 1.65, 2.0)
 WIDTHS = np.array([0, 0.35, 0.5, 0.7, 0.95, 1.25, 1.65, 2.2, 2.9, 3.9, 5.4, 7.5, 10.0])
 # Iterations that tell which blur is best; and a loss after which wider blurs are not tried, as a ratio of errors.
 ITERATIONS, HOPELESS = 8, 4.0
-# Width of the transition around a title, pixels.
+# Standard deviation of the transition around a title, pixels.
 FADED = 5.0
 # A blur that is wider than the widest by this factor is taken for hopeless.
 BEYOND = 1.5
@@ -135,7 +135,7 @@ def known_of(clip: SimulatedClip) -> dict[str, object]:
 
 def without_title(image: FloatArray, hidden: np.ndarray) -> FloatArray:
     """Fade an image (H, W) to its mean where a title hides it."""
-    share = np.maximum(cv2.GaussianBlur(np.float32(hidden), (0, 0), FADED), hidden)
+    share = cv2.GaussianBlur(np.float32(hidden), (0, 0), FADED)
     return image + share * (image[~hidden].mean() - image)
 
 
@@ -183,7 +183,10 @@ def fitted_blur(image: FloatArray, truth: FloatArray) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class TrainingClips:
-    """Features (n, f), width and exponent (n), gains in visible error, dB, (n, e, w), and by the posterior's shape."""
+    """Features (n, f), width and exponent (n), and gains in visible error, dB.
+
+    Gains are those for every exponent (n, e, w), and for that of the posterior (n, w).
+    """
 
     simulators: np.ndarray
     features: np.ndarray

@@ -76,8 +76,8 @@ _CHECKS = {
         "--sigma {0:.2f} removes all; ignore this if edges ring then",
     ),
     CheckKind.LESS_THAN_MEASURED: (
-        "{0:.2f} pixels of blur were measured ({1:.2f} to {2:.2f}), and less or none is removed: more is not expected "
-        "to improve the image",
+        "{0:.2f} pixels of blur were measured ({1:.2f} to {2:.2f}), and less or none is removed: whether more would "
+        "improve the image is doubtful",
         "--sigma {0:.2f} shows whether it does",
     ),
     CheckKind.BLUR_UNKNOWN: (

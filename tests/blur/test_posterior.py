@@ -9,6 +9,7 @@ import pytest
 from turbrestore.blind.decisions import explain_posterior
 from turbrestore.blind.remove_blur import find_blur, remove_blur_steps
 from turbrestore.blur.estimation import find_candidates
+from turbrestore.blur.learnt import LearntBlur
 from turbrestore.blur.posterior import EXCLUDED, BlurWitnesses, blur_posterior, estimate_posterior, measure_witnesses
 from turbrestore.blur.psf import half_frequency, radial_otf
 from turbrestore.blur.witnesses.hypotheses import hypotheses, shapes
@@ -108,7 +109,7 @@ def test_nothing_is_removed_from_a_sharp_clip_that_stands_still():
     result = finish(remove_blur_steps(image, image, found=found))
     assert result.deconvolution.sigma == 0 and result.posterior.removed == 0
     np.testing.assert_array_equal(result.deconvolution.image, np.clip(image, 0, 1))
-    assert "removing one would not be seen to improve it" in result.decisions[0].reason
+    assert "removing one is not expected to improve it" in result.decisions[0].reason
 
 
 def test_a_lens_is_told_from_the_air():
@@ -130,8 +131,26 @@ def test_a_wide_blur_that_stands_still_is_found(sigma):
     assert by_theory.width[1] == pytest.approx(sigma, rel=0.3)
     _, found = estimate_posterior(image, witnesses, white_noise(0.004 / 12**0.5))
     assert 0.6 * sigma < found.width[1] < 1.3 * sigma
-    # Hardly any training clip is blurred by more than six pixels: what is not known to gain is not removed.
+    # Hardly any training clip is blurred by more than six pixels: a loss may be expected, and then nothing is removed.
     assert 0.4 * sigma < found.removed < 1.2 * sigma or (sigma > 6 and found.removed == 0)
+
+
+@pytest.mark.parametrize("exponent", [None, 1.7])
+def test_networks_get_the_quantiles_of_the_posterior_and_its_shape_is_removed(monkeypatch, exponent):
+    frames, flows = still_clip(cv2.GaussianBlur(SCENES["camera"](128, 128), (0, 0), 1.5))
+    image, given = frames.mean(axis=0), []
+
+    def learnt(_features, widths):
+        given.append(widths)
+        return LearntBlur(np.array([1.0, 1.2, 1.4]), 1.1)
+
+    monkeypatch.setattr("turbrestore.blur.posterior.learnt_blur", learnt)
+    witnesses = measure_witnesses(frames, flows, image, BlurWitnesses(0.0, 12.0))
+    evidence, found = estimate_posterior(image, witnesses, white_noise(0.001), exponent=exponent)
+    by_theory = blur_posterior(evidence, witnesses, witnesses.variation.with_power(image))
+    np.testing.assert_array_equal(given[0], by_theory.width)
+    assert found.removed == 1.1 and found.width.tolist() == [1.0, 1.2, 1.4]
+    assert found.exponent == (exponent or by_theory.exponent)
 
 
 def test_one_wrong_witness_is_outvoted():

@@ -120,8 +120,8 @@ class TestPage:
         ("sigma", "removed", "limited", "reason"),
         [
             (0.9, 0.9, False, ""),
-            (0.0, 0.0, False, "; removing more would not be seen to help"),
-            (0.3, 0.3, False, "; removing more would not be seen to help"),
+            (0.0, 0.0, False, "; whether removing more would help is doubtful"),
+            (0.3, 0.3, False, "; whether removing more would help is doubtful"),
             (0.3, 0.3, True, "; the edges of the image are too steep for more"),
             (0.3, 0.9, False, "; the guards against ringing and noise forbid more"),
         ],

@@ -47,7 +47,7 @@ def explain_posterior(posterior: BlurPosterior, removed: float) -> Decision:
     if posterior.edge_limited:
         reason = f"the edges of the image are too steep for more; {reason}"
     elif posterior.removed == 0:
-        reason = f"removing one would not be seen to improve it; {reason}"
+        reason = f"removing one is not expected to improve it; {reason}"
     for name, found in witnesses.items():
         if found[0] > high or found[2] < low:
             reason += f"; {name} alone would give {'more' if found[0] > high else 'less'}"

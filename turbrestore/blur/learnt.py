@@ -5,9 +5,10 @@ Symbols
 x : what the witnesses say, standardised: widths by every witness and by their posterior, s and s_4, the spectrum of the
     image, that of its noise, the ratio to that of the mean of the frames, and costs of the image
 σ, p : width and exponent of the transfer function of the image; see :func:`turbrestore.blur.psf.blur_otf`
-σ_16 : width that is exceeded with a probability of 84 % by the posterior
+σ_16 : width that, by the posterior, is exceeded with a probability of 84 %
 G : gain, decibels, by which the visible error ``e² + e_0²`` falls where a blur of some width is removed, whose exponent
-    is that of the posterior; e² is the mean squared error, and e_0² that of 38 dB, below which no error is seen
+    is that of the posterior, or 1.3 if that is less; e² is the mean squared error, and e_0² that of 38 dB, below which
+    no error is seen
 
 A few small networks, trained alike from different starts, map x to ln σ with its deviation, and to G on a grid of
 widths; widths are relative to that of the posterior, which is about right at every scale.  Their mean counts, and their
@@ -16,7 +17,7 @@ the widest is chosen that is no wider than σ or than the best.
 
 What is removed is the geometric mean of that width and σ_16, or nothing where G expects a loss from it.  The networks
 know more simulators than the theory of the posterior, and are wrong where a clip is like none of them; the posterior
-errs elsewhere.  Clips that neither was made on are restored better with the mean than with either alone.
+errs elsewhere.  ``benchmarks/decisions/blur.md`` compares the mean with either.
 
 ``python benchmarks/blur_training.py`` makes the clips, trains and judges the networks, and writes ``learnt_blur.npz``.
 """
@@ -56,10 +57,10 @@ _PROFILE = 9 / 64
 
 @dataclass(frozen=True, eq=False)
 class LearntBlur:
-    """What the networks say about the blur of an image."""
+    """What the networks say about the blur of an image, and what follows from them and from the posterior."""
 
     width: Float64Array  # (3,): 16 %, 50 % and 84 % quantiles of the width, pixels
-    removed: float  # width of the blur to remove, pixels; 0 if none gains
+    removed: float  # width of the blur to remove, pixels; 0 if a loss is expected
 
 
 def blur_features(
@@ -132,11 +133,11 @@ def learnt_blur(
 
 
 def _widest(gains: Float64Array, most: float) -> float:
-    """Widest factor whose gain is as good as the largest, and that is at most the one given or that of the largest."""
+    """Widest factor that gains as much as the best, at most the one given or the best one; 0 if all of them lose."""
     tried = np.linspace(FACTORS[1], FACTORS[-1], _TRIED)
     found = np.interp(tried, FACTORS, gains)
     most = max(most, float(tried[found.argmax()]))
-    good = tried[(found >= gains.max() - _ALIKE) & (tried <= most)]
+    good = tried[(found >= max(float(found.max()), 0.0) - _ALIKE) & (tried <= most)]
     return float(good.max()) if good.size else 0.0
 
 

@@ -24,8 +24,9 @@ does not blur it.
 
 The air and the lens look alike in 1 and 3, and the air alone varies.
 
-What is removed, and the width that is reported, are learnt from simulated clips, for which this posterior and all
-that the witnesses measure are the input (:mod:`turbrestore.blur.learnt`).
+The width that is reported is learnt from simulated clips, for which this posterior and all that the witnesses measure
+are the input.  The width that is removed is the geometric mean of a learnt one and of the 16 % quantile of this
+posterior, and its exponent is that of this posterior (:mod:`turbrestore.blur.learnt`).
 
 Constants of the likelihoods were set on simulated clips; ``benchmarks/results/blur_calibration.md`` is of others.
 """
@@ -127,9 +128,9 @@ def estimate_posterior(
     runtime: Runtime = DEFAULT,
     exponent: float | None = None,
 ) -> tuple[ImageEvidence | None, BlurPosterior]:
-    """Estimate the blur of an image (H, W) of some noise; none is removed where the image shows nothing.
+    """Estimate the blur of an image (H, W) of some noise; none is removed where it shows nothing or a loss is expected.
 
-    ``exponent`` is that of the transfer function, if it is given.
+    ``exponent`` is that of the transfer function, if it is given; the width is still chosen for that of the posterior.
     """
     evidence, variation = image_evidence(image, runtime), witnesses.variation
     ratio = None if variation is None else variation.with_power(image)

@@ -248,7 +248,7 @@ def _why_less(restoration: Restoration, posterior: BlurPosterior) -> str:
         return "; the guards against ringing and noise forbid more"
     if posterior.edge_limited:
         return "; the edges of the image are too steep for more"
-    return "; removing more would not be seen to help"
+    return "; whether removing more would help is doubtful"
 
 
 def _as_written(value: Any) -> str:
