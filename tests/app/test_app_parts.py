@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
+from turbrestore.blur.posterior import BlurPosterior
 from turbrestore.core.decision import Decision
 from turbrestore.core.errors import ConfigurationError, DataError, OutputError
 from turbrestore.core.verdict import CheckKind
@@ -195,6 +196,12 @@ class TestOrders:
 
 
 class TestTuning:
+    def test_it_starts_from_the_shape_that_was_removed(self, restored):
+        width = np.array([1.0, 1.2, 1.4])
+        posterior = BlurPosterior(1.1, 1.37, width, width, width, width, air=1.0, edge_limited=False)
+        found = replace(restored.restoration, posterior=posterior)
+        assert tuned_params(replace(restored, restoration=found)).exponent == 1.37
+
     def test_the_last_impression_is_the_method_itself(self, restored):
         params = replace(tuned_params(restored), sigma=1.5, fidelity=500.0, iterations=100)
         part = part_around((64, 64), 0, 40, side=32)
