@@ -97,3 +97,19 @@ def test_the_halves_are_deblurred_by_the_shape_of_blur_that_was_asked_for(monkey
 def test_what_the_noise_costs_is_told(clean):
     seconds = restore(clean[:8], QUICK).seconds
     assert {"noise", "agreement"} <= seconds.keys()
+
+
+@pytest.mark.parametrize(("share", "sharpened"), [(0.4, True), (0.6, False)])
+def test_an_image_on_most_of_whose_detail_the_frames_disagree_is_not_sharpened(clean, monkeypatch, share, sharpened):
+    monkeypatch.setattr(evidence, "disputed_detail", lambda *_: share)
+    found = restore(np.clip([cv2.GaussianBlur(frame, (0, 0), 1.5) for frame in clean], 0, 1), QUICK)
+    removed = [one.choice for one in found.decisions if one.subject == "blur"]
+    if sharpened:
+        assert found.deconvolution.sigma > 0.5 and len(removed) == 1
+        return
+    assert found.deconvolution.sigma == found.posterior.removed == 0
+    assert removed[1] == "none removed" and removed[0] != "none removed"
+    np.testing.assert_array_equal(found.deconvolution.image, found.filtered.recentred().image)
+    # The guards have not forbidden it.
+    kinds = {check.kind for check in found.verdict.checks}
+    assert CheckKind.LESS_THAN_MEASURED in kinds and CheckKind.NO_BLUR_REMOVED not in kinds

@@ -9,16 +9,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .agreement.last_guard import Guarded, keep_agreed
+from .agreement.last_guard import MOSTLY, Guarded, disputed_detail, keep_agreed
+from .blind.remove_blur import Deblurred, left_blurred
 from .blind.structure import compare_structure
-from .blur.posterior import BlurPosterior, BlurWitnesses, measure_witnesses
+from .blur.posterior import BlurWitnesses, measure_witnesses
 from .blur.witnesses.short_exposure import displacement_variance
 from .core.arrays import ROUNDING, FloatArray, luminance
 from .core.decision import Decision
 from .core.noise import NoiseCurve, photon_noise
 from .core.noise_spectrum import NoiseSpectrum
 from .deconvolution.conjugate_gradient import wiener_filtered
-from .deconvolution.deconvolve import Deconvolution
 from .filtering.filter_records import Filtered
 from .fusion import Run
 from .registration.flow_algebra import invert_flow
@@ -120,9 +120,21 @@ def _of_optics(known: BlurWitnesses, run: Run, seeing: Seeing | None) -> BlurWit
 
 
 def agreed_image(
-    run: Run, done: Deconvolution, posterior: BlurPosterior, halves: HalvedClip, photons: NoiseCurve | None
-) -> Guarded:
+    run: Run, fused: Restoration, deblurred: Deblurred, halves: HalvedClip, photons: NoiseCurve | None
+) -> tuple[Deblurred, Guarded]:
+    """Keep what the halves of the clip agree on; where that is little of the detail, no blur is removed."""
+    agreed = _agreed(run, deblurred, halves, photons)
+    if deblurred.deconvolution.sigma == 0 or disputed_detail(agreed.share, fused.mean) <= MOSTLY:
+        return deblurred, agreed
+    deblurred = left_blurred(deblurred, fused.image)
+    run.decide(deblurred.decisions[-1])
+    return deblurred, _agreed(run, deblurred, halves, photons)
+
+
+def _agreed(run: Run, deblurred: Deblurred, halves: HalvedClip, photons: NoiseCurve | None) -> Guarded:
     """Compare the halves of the clip behind the deconvolution of the image, and keep what they agree on."""
+    done, posterior = deblurred.deconvolution, deblurred.posterior
+    assert posterior is not None
     exponent = run.params.deconvolution.exponent or posterior.exponent
 
     def sharpened(half: FloatArray) -> FloatArray:

@@ -207,7 +207,7 @@ def _deblur_and_crop(run: Run, fused: Restoration, evidence: Evidence, psf: NDAr
         run.decide(*deblurred.decisions)
         image = deblurred.deconvolution.image
         if halves is not None and deblurred.posterior is not None:
-            agreed = agreed_image(run, deblurred.deconvolution, deblurred.posterior, halves, photons)
+            deblurred, agreed = agreed_image(run, fused, deblurred, halves, photons)
             run.decide(*agreed.decisions)
             image = agreed.image
     seen = coverage(fused.centroid.flows)

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
+from .agreement.last_guard import MOSTLY, disputed_detail
 from .agreement.repetition import repetition
 from .blind.guards import GuardReading
 from .blind.structure import StructureReading
 from .blur.estimation import BlurEstimate
 from .blur.posterior import BlurPosterior
-from .core.arrays import ROUNDING, FloatArray, luminance
+from .core.arrays import ROUNDING, FloatArray
 from .core.decision import Decision
-from .core.gradient import sobel_gradient
 from .core.noise_spectrum import NoiseSpectrum
 from .core.remarks import counted
 from .core.verdict import Check, CheckKind, Verdict
@@ -248,7 +248,7 @@ def _checks(restoration: Restoration, motion: float) -> Iterator[Check]:
         yield write_check(CheckKind.GEOMETRY, error, counted(kept, "frame"))
     if structure is not None and structure.left > _HALF:
         yield write_check(CheckKind.MOTION, structure.left)
-    if (disputed := _disputed(restoration)) > _HALF:
+    if (disputed := _disputed(restoration)) > MOSTLY:
         yield write_check(CheckKind.AGREEMENT, disputed)
     yield from _checks_of_blur(restoration)
 
@@ -288,10 +288,8 @@ def _share_of_air(flows: FloatArray) -> float:
 
 
 def _disputed(restoration: Restoration) -> float:
-    """Share of the mean in the result, where each pixel counts by the energy of the detail that the mean has there."""
-    share = restoration.disagreement
-    if share is None:
+    """Share of the detail of the result on which the frames do not agree."""
+    if restoration.disagreement is None:
         return 0.0
     x, y, width, height = restoration.crop
-    detail = np.hypot(*sobel_gradient(luminance(restoration.mean[y : y + height, x : x + width]))) ** 2
-    return float((share * detail).sum() / max(float(detail.sum()), ROUNDING**2))
+    return disputed_detail(restoration.disagreement, restoration.mean[y : y + height, x : x + width])

@@ -35,8 +35,9 @@ from functools import partial
 import cv2
 import numpy as np
 
-from ..core.arrays import FloatArray, luminance
+from ..core.arrays import ROUNDING, FloatArray, luminance
 from ..core.decision import Decision
+from ..core.gradient import sobel_gradient
 from ..core.noise import NoiseCurve
 from ..core.noise_spectrum import SIDE, NoiseSpectrum
 from ..registration.registered_noise import Halves
@@ -56,6 +57,8 @@ _LEAST_TINT, _TINT = 1 / 255, 2 / 255
 _ROWS, _AROUND = 256, 128
 # Bytes a pixel, and a pixel and channel, of these rows.
 _BYTES, _CHANNEL_BYTES = 74, 50
+# Share of the detail from which on the frames do not agree on the image as a whole.
+MOSTLY = 0.5
 # Least g, and the share of the image that has it, that is worth a remark.
 _CLEAR, _REMARKED = 0.5, 0.15
 
@@ -100,6 +103,12 @@ def keep_agreed(
     choice = f"in {100 * clear:.0f} % of the image, the mean of the registered frames is kept without sharpening"
     reason = "the halves of the clip disagree there: noise, water, clouds, rain or registration that failed"
     return Guarded(image, share, (Decision("agreement", choice, reason),))
+
+
+def disputed_detail(share: FloatArray, mean: FloatArray) -> float:
+    """Return the share of the mean in the result, where a pixel counts by the detail that the mean (H, W[, 3]) has."""
+    detail = np.hypot(*sobel_gradient(luminance(mean))) ** 2
+    return float((share * detail).sum() / max(float(detail.sum()), ROUNDING**2))
 
 
 def keep_agreed_memory(shape: tuple[int, ...]) -> float:

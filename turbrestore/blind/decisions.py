@@ -13,9 +13,14 @@ from .guards import GuardParams, GuardReading
 _MOSTLY = 0.8
 
 
+def explain_choice(removed: float) -> str:
+    """Say which width is removed, pixels."""
+    return f"{removed:.2f} pixels removed" if removed > 0 else "none removed"
+
+
 def explain_blur(blur: BlurEstimate | None, sigma: float, given: str = "asked for") -> Decision:
     """Explain which width is removed; ``given`` is the reason if none was estimated."""
-    choice = f"{sigma:.2f} pixels removed" if sigma > 0 else "none removed"
+    choice = explain_choice(sigma)
     if blur is None:
         return Decision("blur", choice, given)
     width = f"{blur.sigma:.2f} ± {blur.uncertainty:.2f} pixels"
@@ -31,7 +36,7 @@ def explain_blur(blur: BlurEstimate | None, sigma: float, given: str = "asked fo
 
 def explain_posterior(posterior: BlurPosterior, removed: float) -> Decision:
     """Explain which width is removed in the end, pixels, and what each witness says."""
-    choice = f"{removed:.2f} pixels removed" if removed > 0 else "none removed"
+    choice = explain_choice(removed)
     low, width, high = posterior.width
     witnesses = {
         "the displacement": posterior.by_displacement,

@@ -27,7 +27,7 @@ from ..runtime.device import CPU, find_device
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import to_scratch
 from ..runtime.tiling import HALO, HaloTile, add_tile, halo_tiles, largest_tile, new_mosaic
-from .decisions import explain_blur, explain_guards, explain_posterior
+from .decisions import explain_blur, explain_choice, explain_guards, explain_posterior
 from .guards import BACK_OFF, GuardParams, GuardReading, evaluate_guards
 
 # Bytes per pixel, and per pixel and channel, of what is computed before and after the deconvolution; the guards take
@@ -58,6 +58,18 @@ class Deblurred:
     readings: tuple[GuardReading, ...]  # one for each width that was removed; empty if no blur was removed
     decisions: tuple[Decision, ...]  # on the blur and on the guards
     posterior: BlurPosterior | None = None  # none if the width was given, or nothing is known but the image
+
+
+def left_blurred(done: Deblurred, image: FloatArray) -> Deblurred:
+    """Return the image as it was in place of a deblurred one, on most of whose detail the frames do not agree."""
+    assert done.posterior is not None
+    reason = "the halves of the clip do not agree on most of the detail that removing one sharpens"
+    return replace(
+        done,
+        deconvolution=replace(done.deconvolution, image=image, sigma=0.0),
+        posterior=replace(done.posterior, removed=0.0),
+        decisions=(*done.decisions, Decision("blur", explain_choice(0.0), reason)),
+    )
 
 
 def remove_blur_steps(
