@@ -54,14 +54,16 @@ def clock_digits(survey: Survey, level: float, mask: NDArray[np.bool_]) -> NDArr
     if not moving.any():
         return moving
     share = np.where(moving, np.divide(static, np.maximum(edges, 1), dtype=np.float64), 0)
-    # Where the scene hardly moves, its edges stay at times as well.
-    usual = max(float(np.quantile(share[moving], 0.9)) / _USUAL, 1.0)
+    near = around(mask, len(mask) // LINE)
+    # Where the scene hardly moves, its edges stay at times as well; those near the overlay may be digits.
+    scene = share[moving & ~near]
+    usual = max(float(np.quantile(scene, 0.9)) / _USUAL, 1.0) if scene.size else 1.0
     share[static < _TIMES] = 0
     # A clock has a colon, a date or digits that do not change; blocks that a coder copies lie anywhere.
-    digits = _large(around(mask, len(mask) // LINE) & (share > _REMAINS * usual))
+    digits = _large(near & (share > _REMAINS * usual))
     if usual <= _ALMOST_USUAL:
-        near = around(digits | mask, BESIDE)
-        digits |= _large(near & (share > _REMAINS_BESIDE * usual))
+        beside = around(digits | mask, BESIDE)
+        digits |= _large(beside & (share > _REMAINS_BESIDE * usual))
     return digits if digits.mean() <= _MOST_DIGITS else np.zeros_like(digits)
 
 
