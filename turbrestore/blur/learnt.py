@@ -3,7 +3,8 @@
 Symbols
 -------
 x : what the witnesses say, standardised: widths by every witness and by their posterior, s and s_4, the spectrum of the
-    image, that of its noise, the ratio to that of the mean of the frames, and costs of the image
+    image, that of its noise, the ratio to that of the mean of the frames, costs of the image, and the distribution of
+    its levels and gradients
 σ, p : width and exponent of the transfer function of the image; see :func:`turbrestore.blur.psf.blur_otf`
 σ_16 : width that, by the posterior, is exceeded with a probability of 84 %
 G : gain, decibels, by which the visible error ``e² + e_0²`` falls where a blur of some width is removed, whose exponent
@@ -29,10 +30,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.arrays import FloatArray
+from ..core.arrays import ROUNDING, FloatArray
 from ..core.noise_spectrum import NoiseSpectrum
 from .psf import Float64Array
 from .witnesses.image_evidence import ImageEvidence
@@ -51,6 +53,8 @@ _ALIKE, _TRIED = 0.05, 200
 LOG_SPREADS = (-3.0, 1.0)
 # Standardised values beyond this were hardly seen in training.
 FARTHEST = 4.0
+# Reductions at which gradients are read, and the shortest side that they leave, pixels.
+_SCALES, _FEWEST = (1, 2, 4, 8), 8
 # Mean of the squared window of SIDE pixels along both axes.
 _PROFILE = 9 / 64
 
@@ -108,6 +112,7 @@ def blur_features(
         rows += [[np.log(evidence.widths[curve.argmin()]), min(_GRADIENTS * curve.min(), _DEAREST)]]
         rows += [np.minimum(read, _DEAREST)]
     rows += [_log([estimate.sigma], 0.05), [np.log(estimate.reduction)], _log([estimate.noise], 1e-5)]
+    rows += [_distribution(image)]
     return np.concatenate([np.asarray(row, np.float64) for row in rows])
 
 
@@ -144,6 +149,24 @@ def _widest(gains: Float64Array, most: float) -> float:
 def _spectrum(image: FloatArray) -> Float64Array:
     """Power spectrum of an image by ring; NaN if it is too small for a window."""
     return window_power(image) if min(image.shape) >= SIDE * 3 // 2 else np.full(len(RINGS), np.nan)
+
+
+def _distribution(image: FloatArray) -> list[float]:
+    """Skewness and kurtosis of the levels, and sparsity of the gradients at some scales: text looks like no photograph.
+
+    The latter is the mean size of a difference over the root of its mean square, as a logarithm.
+    """
+    level = (image - image.mean()) / max(float(image.std()), ROUNDING)
+    found = [float(np.mean(level**3)), float(np.log(max(np.mean(level**4), 1.0)))]
+    for scale in _SCALES:
+        size = image.shape[1] // scale, image.shape[0] // scale
+        if min(size) < _FEWEST:
+            found.append(np.nan)
+            continue
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        steps = np.concatenate([np.diff(small, axis=0).ravel(), np.diff(small, axis=1).ravel()])
+        found.append(float(np.log(max(np.abs(steps).mean(), ROUNDING) / max(float(steps.std()), ROUNDING))))
+    return found
 
 
 def _log(values: object, least: float) -> Float64Array:
