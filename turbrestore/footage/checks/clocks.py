@@ -61,7 +61,7 @@ def clock_digits(survey: Survey, level: float, mask: NDArray[np.bool_]) -> NDArr
     share[static < _TIMES] = 0
     # A clock has a colon, a date or digits that do not change; blocks that a coder copies lie anywhere.
     digits = _large(near & (share > _REMAINS * usual))
-    if usual <= _ALMOST_USUAL:
+    if digits.any() and usual <= _ALMOST_USUAL:
         beside = around(digits | mask, BESIDE)
         digits |= _large(beside & (share > _REMAINS_BESIDE * usual))
     return digits if digits.mean() <= _MOST_DIGITS else np.zeros_like(digits)
