@@ -32,7 +32,7 @@ from turbrestore import DeconvolutionParams, TurbrestoreError, pipeline
 from turbrestore.blind import remove_blur
 from turbrestore.blur import posterior
 from turbrestore.blur.learnt import FACTORS, FARTHEST, LOG_SPREADS, LearntBlur, blur_features, learnt_blur
-from turbrestore.blur.psf import radial_otf
+from turbrestore.blur.psf import GAUSSIAN, radial_otf
 from turbrestore.blur.witnesses.spectral_variation import RINGS, SIDE
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.noise_spectrum import NoiseSpectrum
@@ -43,11 +43,8 @@ WEIGHTS = Path(__file__).resolve().parent.parent / "turbrestore" / "blur" / "lea
 # Mean squared error that is invisible; gains, dB, below which all losses count alike in the table, and in training,
 # where the best widths are to be told apart and not the worst; unit of the networks, dB.
 INVISIBLE, WORST, HARMFUL, UNIT = 10**-3.8, -8.0, -4.0, 3.0
-# Exponents, beside that of the posterior, and widths, pixels, that are removed.
-EXPONENTS = (1.3, 2.0)
+# Widths that are removed, pixels.
 WIDTHS = np.array([0, 0.35, 0.5, 0.7, 0.95, 1.25, 1.65, 2.2, 2.9, 3.9, 5.4, 7.5, 10.0])
-# Scales, pixels, between which errors are told apart.
-BANDS = (0.7, 1.4, 2.8, 5.6)
 # Iterations that tell which blur is best; and a loss after which wider blurs are not tried, as a ratio of errors.
 ITERATIONS, HOPELESS = 8, 4.0
 # Standard deviation of the transition around a title, pixels.
@@ -114,8 +111,7 @@ def known_of(clip: SimulatedClip) -> dict[str, object]:
         return prepared
 
     def spy_features(*given: object) -> object:
-        known["features"] = blur_features(*given)
-        known["image"], known["noise"] = given[0], given[5]
+        known["read"] = given
         raise _ReachedError
 
     prepare = pipeline.prepare
@@ -126,14 +122,15 @@ def known_of(clip: SimulatedClip) -> dict[str, object]:
         pass
     except TurbrestoreError as error:
         return {"refused": str(error)}
-    if "image" not in known:
+    if "read" not in known:
         return {"refused": "no blur is looked for"}
-    image = known.pop("image")
-    truth = registered(known.pop("levels").stretched(clip.truth), image)
+    image, noise = known["read"][0], known["read"][5]
+    truth = registered(known["levels"].stretched(clip.truth), image)
     width, exponent = fitted_blur(*(without_title(one, clip.hidden) for one in (image, truth)))
-    exponents = np.array([known["features"][SHAPE], *EXPONENTS])
-    errors = errors_of(image, truth, known["noise"], ~clip.hidden[CORE], exponents)
-    return {"features": known["features"], "width": width, "exponent": exponent, "errors": errors}
+    seen, usual = ~clip.hidden[CORE], blur_features(*known["read"])[SHAPE]
+    errors = errors_of(image, truth, noise, seen, WIDTHS, usual)
+    right = errors_of(image, truth, noise, seen, np.array([0.0, width]), min(exponent, GAUSSIAN))[1]
+    return {"read": known["read"], "width": width, "errors": errors, "right": right}
 
 
 def without_title(image: FloatArray, hidden: np.ndarray) -> FloatArray:
@@ -143,30 +140,22 @@ def without_title(image: FloatArray, hidden: np.ndarray) -> FloatArray:
 
 
 def errors_of(
-    image: FloatArray, truth: FloatArray, noise: NoiseSpectrum, seen: np.ndarray, exponents: np.ndarray
+    image: FloatArray, truth: FloatArray, noise: NoiseSpectrum, seen: np.ndarray, widths: np.ndarray, exponent: float
 ) -> FloatArray:
-    """Mean squared errors (exponents, widths, bands) of the image without every blur; NaN where hopeless.
+    """Mean squared errors (n,) of the image without blurs of some widths, from none on; NaN where hopeless.
 
     Pixels of the core that are not ``seen`` do not count: a title is sharp, so that it rings whatever is removed.
     """
-    errors = np.full((len(exponents), len(WIDTHS), len(BANDS) + 1), np.nan)
-    for row, exponent in zip(errors, exponents, strict=True):
-        params = DeconvolutionParams(exponent=exponent, iterations=ITERATIONS)
-        for place, width in enumerate(WIDTHS):
-            if width * remove_blur.SIGMAS_A_SIDE > min(image.shape):
-                break
-            result = deconvolve(image, width, params, runtime=Runtime(threads=1), noise=noise).image
-            row[place] = errors_by_band(np.clip(result[CORE], 0, 1) - truth[CORE], seen)
-            if row[place].sum() > max(HOPELESS * np.nanmin(row.sum(-1)), INVISIBLE):
-                break
+    errors = np.full(len(widths), np.nan)
+    params = DeconvolutionParams(exponent=exponent, iterations=ITERATIONS)
+    for place, width in enumerate(widths):
+        if width * remove_blur.SIGMAS_A_SIDE > min(image.shape):
+            break
+        result = deconvolve(image, width, params, runtime=Runtime(threads=1), noise=noise).image
+        errors[place] = np.mean(np.square(np.clip(result[CORE], 0, 1) - truth[CORE])[seen])
+        if errors[place] > max(HOPELESS * np.nanmin(errors), INVISIBLE):
+            break
     return errors
-
-
-def errors_by_band(difference: FloatArray, seen: np.ndarray) -> FloatArray:
-    """Mean squares of a difference (H, W) between the scales of BANDS, finest first; their sum is its mean square."""
-    smooth = [difference, *(cv2.GaussianBlur(difference, (0, 0), scale) for scale in BANDS)]
-    powers = [float(np.mean(np.square(one)[seen])) for one in smooth]
-    return np.array([*(-np.diff(powers)), powers[-1]])
 
 
 def fitted_blur(image: FloatArray, truth: FloatArray) -> tuple[float, float]:
@@ -195,21 +184,13 @@ def fitted_blur(image: FloatArray, truth: FloatArray) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class TrainingClips:
-    """Features (n, f), width and exponent (n), and gains in visible error, dB.
-
-    Gains are those for the exponent of the posterior, followed by the fixed ones, (n, e, w).
-    """
+    """Features (n, f), width (n,), and visible gain, dB, by every one of WIDTHS (n, w) and by the true blur (n,)."""
 
     simulators: np.ndarray
     features: np.ndarray
     width: np.ndarray
-    exponent: np.ndarray
-    every_gain: np.ndarray
-
-    @property
-    def gains(self) -> np.ndarray:
-        """Gains (n, w) for the exponent of the posterior."""
-        return self.every_gain[:, 0]
+    gains: np.ndarray
+    right: np.ndarray
 
     @property
     def posterior(self) -> np.ndarray:
@@ -221,14 +202,15 @@ def read_clips(folder: Path) -> TrainingClips:
     """Read the clips of a folder whose blur was looked for."""
     held = [pickle.loads(path.read_bytes()) for path in sorted(folder.glob("*.pkl"))]
     held = [clip for clip in held if "errors" in clip]
-    visible = -10 * np.log10(np.array([clip["errors"] for clip in held]).sum(-1) + INVISIBLE)
-    gains = np.maximum(np.nan_to_num(visible - visible[..., :1], nan=WORST), WORST)
+    errors = np.array([[*clip["errors"], clip["right"]] for clip in held])
+    visible = -10 * np.log10(errors + INVISIBLE)
+    gains = np.maximum(np.nan_to_num(visible - visible[:, :1], nan=WORST), WORST)
     return TrainingClips(
         np.array([clip["simulator"] for clip in held]),
-        np.array([clip["features"] for clip in held]),
+        np.array([blur_features(*clip["read"]) for clip in held]),
         np.maximum([clip["width"] for clip in held], WIDTHS[1]),
-        np.array([clip["exponent"] for clip in held]),
-        gains,
+        gains[:, :-1],
+        gains[:, -1],
     )
 
 
@@ -298,7 +280,7 @@ def table_of(clips: TrainingClips) -> str:
         "Made by `python benchmarks/blur_training.py train FOLDER --write benchmarks/results/blur_training.md`.",
         "",
         "Error of ln width where the blur exceeds .6 px, and share of true widths within the 68 % interval; gain in",
-        "visible error (MSE plus that of 38 dB), dB, by the best blur of the grid, the true one, and what is removed;",
+        "visible error (MSE plus that of 38 dB), dB, by the best width, by the true blur, and what is removed;",
         "clips that are worse than the filtered image by more than .2 dB.",
         "",
         "| left out | clips | error: bias, median, nine of ten | within | best | true | removed | worse |",
@@ -336,15 +318,11 @@ def _row(title: str, clips: TrainingClips, held: np.ndarray, found: dict[int, Le
     error = (quantiles[:, 1] - true)[wide]
     within = ((true >= quantiles[:, 0]) & (true <= quantiles[:, 2])).mean()
     removed = np.array([_gains_at(clips.gains[place], np.array([found[place].removed]))[0] for place in places])
-    right = [
-        _gains_at(_with_exponent(clips.every_gain[place], clips.exponent[place]), clips.width[place, None])[0]
-        for place in places
-    ]
-    best = clips.every_gain[places].max((1, 2)).mean()
+    best = clips.gains[places].max(1).mean()
     size = np.abs(error) if error.size else np.array([np.nan])
     return (
         f"| {title} | {len(places)} | {np.median(error) if error.size else np.nan:+.2f}, {np.median(size):.2f}, "
-        f"{np.quantile(size, 0.9):.2f} | {within:.0%} | {best:.2f} | {np.mean(right):.2f} | "
+        f"{np.quantile(size, 0.9):.2f} | {within:.0%} | {best:.2f} | {clips.right[places].mean():.2f} | "
         f"{removed.mean():.2f} | {(removed < -0.2).mean():.0%} |"
     )
 
@@ -353,12 +331,6 @@ def _gains_at(gains: np.ndarray, widths: np.ndarray) -> np.ndarray:
     """Gains on the grid of WIDTHS at other widths; those of a narrow blur grow as its square."""
     logs, known = np.log(np.maximum(widths, WIDTHS[1])), np.log([*WIDTHS[1:], BEYOND * WIDTHS[-1]])
     return np.minimum(np.square(widths / WIDTHS[1]), 1) * np.interp(logs, known, [*gains[1:], WORST])
-
-
-def _with_exponent(gains: np.ndarray, exponent: float) -> np.ndarray:
-    """Gains (exponents, widths) for an exponent between the fixed ones (widths)."""
-    share = float(np.interp(exponent, EXPONENTS, (0, 1)))
-    return (1 - share) * gains[1] + share * gains[2]
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""Clips from which the blur is learnt: what a title hides, and gains between the exponents that were tried."""
+"""Clips from which the blur is learnt, and what a title hides of them."""
 
 import cv2
 import numpy as np
 import pytest
 from blur_simulators import SCENES, simulate
-from blur_training import CORE, EXPONENTS, WIDTHS, _with_exponent, errors_of, without_title
+from blur_training import CORE, WIDTHS, errors_of, without_title
 
 from turbrestore.core.noise_spectrum import white_noise
 
@@ -34,15 +34,9 @@ def test_a_title_neither_tells_the_blur_nor_counts_as_an_error():
     for image in (titled, truth):
         image[18:26, 34:62] = np.float32(0.95)
     noise, seen = white_noise(0.002), ~hidden[CORE]
-    hurt, spared = (errors_of(titled, truth, noise, count)[-1] for count in (np.ones_like(seen), seen))
+    hurt, spared = (errors_of(titled, truth, noise, count, WIDTHS, 2.0) for count in (np.ones_like(seen), seen))
     gains = [-10 * np.log10(row[WIDTHS == 1.65] / row[0]) for row in (hurt, spared)]
     # The ringing title alone makes the right width hopeless, which is NaN.
     assert gains[1] > 3 and not gains[0] > 0
     faded = without_title(titled, hidden)
     assert np.ptp(faded[18:26, 34:62]) < 0.02 and abs(faded[70:, 70:] - titled[70:, 70:]).max() < 1e-3
-
-
-def test_gains_between_exponents_are_interpolated():
-    gains = np.array([[0.0, 1.0], [0.0, 2.0], [0.0, 4.0]])
-    for exponent, expected in ((1.0, 1.0), (EXPONENTS[1], 2.0), (1.825, 3.0), (2.0, 4.0)):
-        assert _with_exponent(gains, exponent)[1] == pytest.approx(expected)

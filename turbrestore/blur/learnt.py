@@ -53,8 +53,8 @@ _ALIKE, _TRIED = 0.05, 200
 LOG_SPREADS = (-3.0, 1.0)
 # Standardised values beyond this were hardly seen in training.
 FARTHEST = 4.0
-# Reductions at which gradients are read, and the shortest side that they leave, pixels.
-_SCALES, _FEWEST = (1, 2, 4, 8), 8
+# Reductions at which gradients are read; the shortest side that they leave has as many pixels as the largest.
+_SCALES = (1, 2, 4, 8)
 # Mean of the squared window of SIDE pixels along both axes.
 _PROFILE = 9 / 64
 
@@ -160,7 +160,7 @@ def _distribution(image: FloatArray) -> list[float]:
     found = [float(np.mean(level**3)), float(np.log(max(np.mean(level**4), 1.0)))]
     for scale in _SCALES:
         size = image.shape[1] // scale, image.shape[0] // scale
-        if min(size) < _FEWEST:
+        if min(size) < _SCALES[-1]:
             found.append(np.nan)
             continue
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
