@@ -1,5 +1,7 @@
 """Dark and flat frames: a camera with known offsets and gains is undone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -93,12 +95,30 @@ def test_counts_in_fits_files_are_compared_as_counts(tmp_path, kinds):
     np.testing.assert_allclose(found, SCENE * GAIN * 65535 / white, atol=5e-5)
 
 
+@pytest.mark.parametrize("stored", ["as they are", "in the upper bits", "spread over the range"])
+@pytest.mark.parametrize("wider", ["dark", "clip"])
+def test_twelve_bits_in_files_of_sixteen(stored, wider):
+    counts = {"clip": np.rint((SCENE * GAIN + OFFSET) * 4095), "dark": np.rint(np.tile(OFFSET * 4095, (5, 1, 1)))}
+    step = {"as they are": 1, "in the upper bits": 16, "spread over the range": 65535 / 4095}[stored]
+    made = {name: FrameSource.from_array(np.uint16(values), name) for name, values in counts.items()}
+    made = {name: replace(source, full_scale=4095, bit_depth=12) for name, source in made.items()}
+    made[wider] = FrameSource.from_array(np.uint16(np.rint(counts[wider] * step)), wider)
+    source = calibrated(made["clip"], make_calibration(made["clip"], made["dark"], None))
+    # Full scale of a clip is that of its file.
+    brightness = 4095 / 65535 if wider == "clip" and stored == "as they are" else 1
+    np.testing.assert_allclose(source.read(), SCENE * GAIN * brightness, atol=6e-4)
+
+
 def test_what_does_not_fit_is_refused():
     clip = sources()[0]
     other = FrameSource.from_array(np.zeros((1, 4, 4)), "other")
     for words, arguments in {
         "expected 30×24 grey as in clip, found 4×4 grey": (clip, other, None),
-        "expected values up to 65535": (clip, FrameSource.from_array(np.zeros((1, *SHAPE), np.uint8), "d"), None),
+        "expected values up to 255 as in d, or those spread over 65535": (
+            clip,
+            FrameSource.from_array(np.zeros((1, *SHAPE), np.uint8), "d"),
+            None,
+        ),
         "a flat with light": (clip, None, FrameSource.from_array(np.zeros((1, *SHAPE)), "f")),
         "few hot or dead pixels": (
             clip,

@@ -245,8 +245,32 @@ class TestMosaics:
     def test_mono_is_not_taken_for_a_mosaic(self, ser):
         assert open_frames(ser(moon_like())).warnings == ()
 
+    @pytest.mark.parametrize("right", range(8, 12))
+    @pytest.mark.parametrize("given", range(8, 12))
+    def test_greens_of_a_wrong_pattern_are_unlike(self, ser, right, given):
+        colours = {8: "rggb", 9: "grbg", 10: "gbrg", 11: "bggr"}
+        levels = np.array([{"r": 0.9, "g": 0.5, "b": 0.25}[colour] for colour in colours[right]]).reshape(2, 2)
+        mosaic = np.uint16(moon_like() * np.tile(levels, (32, 32)))
+        source = open_frames(ser(mosaic, colour=given))
+        # Red and blue may be exchanged without a trace.
+        alike = (right in (9, 10)) == (given in (9, 10))
+        assert alike == (source.warnings == ())
+        if not alike:
+            other = " or ".join(
+                name for name in ("rggb", "bggr", "grbg", "gbrg") if (name[0] == "g") == (right in (9, 10))
+            )
+            assert all(
+                "--bayer" in warning and name in warning for warning in source.warnings for name in other.split(" or ")
+            )
+        replaced = open_frames(ser(mosaic, colour=given), bayer=colours[right])
+        assert replaced.warnings == ()
+        np.testing.assert_array_equal(replaced.read(), open_frames(ser(mosaic, colour=right)).read())
+
+    def test_greys_have_no_pattern_to_doubt(self, ser):
+        assert open_frames(ser(moon_like(), colour=8)).warnings == ()
+
     def test_colour_is_no_mosaic(self, ser):
-        refused(ser(self.mosaic(), colour=8), DataError, "--bayer", bayer="rggb")
+        refused(ser(np.tile(self.mosaic()[..., None], 3), colour=100), DataError, "--bayer", bayer="rggb")
         refused(ser(self.mosaic()), ConfigurationError, "rggb", bayer="rgb")
 
     @pytest.mark.parametrize("how", [{"colour": 8}, {"bayer": "rggb"}])

@@ -162,6 +162,22 @@ def looks_like_bayer(pixels: PixelArray) -> bool:
     return True
 
 
+def doubted_pattern(mosaic: PixelArray, pattern: str) -> tuple[Doubt, ...]:
+    """Doubt a pattern whose greens, the two planes of one colour, are less alike than the other two planes."""
+    planes = planes_of(mosaic).astype(np.float32)
+    size = planes.shape[1] // LEAST_SIDE, planes.shape[0] // LEAST_SIDE
+    if min(size) == 0:
+        return ()
+    # Means of blocks have little noise, and little of the detail that is between the planes.
+    blocks = cv2.resize(planes, size, interpolation=cv2.INTER_AREA)
+    outer, inner = (float(np.median(np.abs(blocks[..., m] - blocks[..., n]))) for m, n in ((0, 3), (1, 2)))
+    greens, others = (outer, inner) if pattern[0] == "g" else (inner, outer)
+    if greens <= 2 * others:
+        return ()
+    better = [name for name in BAYER_CODES if (name[0] == "g") != (pattern[0] == "g")]
+    return (Doubt(f"the greens of the Bayer pattern {pattern} are unlike: --bayer {' or '.join(better)} may be right"),)
+
+
 def planes_of(mosaic: PixelArray) -> PixelArray:
     """Split a mosaic (H, W) into its planes (H // 2, W // 2, 4); a last odd row or column is left out."""
     height, width = mosaic.shape[0] // 2 * 2, mosaic.shape[1] // 2 * 2

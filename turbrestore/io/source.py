@@ -22,7 +22,7 @@ from ..core.errors import ConfigurationError, DataError, require
 from ..core.remarks import Doubt, counted
 from ..runtime.scratch import iter_frames
 from .output import size_text
-from .pixels import PixelArray, depth_of, full_scale_of, to_unit
+from .pixels import PixelArray, demosaic, depth_of, full_scale_of, to_unit
 
 FrameRange = tuple[int | None, int | None] | tuple[int | None, int | None, int | None]
 Roi = tuple[int, int, int, int]
@@ -68,8 +68,8 @@ class FrameSource:
         Cards of the header of a FITS file, 80 characters each.
     repair : callable or None
         Applied to the native pixels of every frame first.
-    develop : callable or None
-        Turns repaired native pixels into a frame, such as a Bayer mosaic into colours.
+    bayer : str or None
+        Colours of the first pixels, such as ``rggb``, where native pixels are the mosaic of a Bayer sensor.
     adjust : callable or None
         Takes the number of a frame in the file, its intensities, and the rows and columns of the file that they are;
         returns the intensities that are used instead, which may lie outside [0, 1].
@@ -101,7 +101,7 @@ class FrameSource:
     unseen: NDArray[np.bool_] | None = field(default=None, repr=False)
     header: tuple[str, ...] = field(default=(), repr=False)
     repair: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
-    develop: Callable[[PixelArray], PixelArray] | None = field(default=None, repr=False)
+    bayer: str | None = None
     adjust: Callable[[int, FloatArray, Window], FloatArray] | None = field(default=None, repr=False)
     numbers: range | tuple[int, ...] = _ALL
     window: Window = _ALL
@@ -190,7 +190,7 @@ class FrameSource:
         >>> list(FrameSource.from_array(np.full((2, 1, 1), 7, np.uint8)).mosaics())
         [None, None]
         """
-        if self.develop is None:
+        if self.bayer is None:
             yield from (None for _ in self.numbers)
         else:
             yield from self.pixels(self.numbers)
@@ -335,7 +335,7 @@ class FrameSource:
         # Without iter_frames a memory-mapped video would be in memory as a whole at the end.
         for number, native in zip(chosen, iter_frames(self.pixels(chosen)), strict=False):
             repaired = native if self.repair is None else self.repair(native)
-            pixels = repaired if self.develop is None else self.develop(repaired)
+            pixels = repaired if self.bayer is None else demosaic(repaired, self.bayer)
             if pixels.shape != self.file_shape[1:]:
                 expected, found = size_text(self.file_shape[1:]), size_text(pixels.shape)
                 raise DataError(f"{self.name}: frame {number}: expected {expected} as the first frame, found {found}")

@@ -45,7 +45,7 @@ from .images.tiff import TIFF_SUFFIXES, open_tiff, write_tiff
 from .limits import DEFAULT_LIMITS, Limits, check_input, content_suffix, input_errors
 from .npy import open_npy, write_npy
 from .output import check_output
-from .pixels import BAYER_CODES, check_depth, demosaic, to_unit
+from .pixels import BAYER_CODES, check_depth, doubted_pattern, to_unit
 from .source import FrameRange, FrameSource, Roi, numbers_text, to_slice
 
 VIDEO_SUFFIXES = (*CONTAINER_SUFFIXES, ".ser", *TIFF_SUFFIXES, ".npy", *ANIMATION_SUFFIXES, *FITS_SUFFIXES)
@@ -85,7 +85,8 @@ def open_frames(
         Read a file that is cut short up to the cut, and leave out frames that are damaged, up to the next key frame
         where others depend on them, with a warning, instead of raising DataError.
     bayer : {"rggb", "grbg", "gbrg", "bggr"}, optional
-        Take grey frames for mosaics of a Bayer sensor whose first pixels have these colours.
+        Take grey frames, and mosaics whose file names another pattern, for those of a Bayer sensor whose first pixels
+        have these colours.
     hdr : {"sdr", "keep"}
         Turn HDR video (HLG, PQ) into the SDR picture, or keep its codes.
     axes : str, optional
@@ -122,6 +123,9 @@ def open_frames(
     source = source if bayer is None else _as_bayer(source, bayer)
     source = source.select(frames, roi)
     source = source.without(source.damaged, Doubt(f"damaged: {numbers_text(source.damaged)} left out"))
+    mosaic = next(source.select((0, 1)).mosaics())
+    if source.bayer is not None and mosaic is not None:
+        source = dataclasses.replace(source, warnings=(*source.warnings, *doubted_pattern(mosaic, source.bayer)))
     # Only the reader of a container sets a colour.  It has decoded the first frame of the file, and no frame of a video
     # is beyond full scale.
     if source.colour is None:
@@ -246,17 +250,14 @@ def _suffix_of(path: Path) -> str:
 
 
 def _as_bayer(source: FrameSource, pattern: str) -> FrameSource:
-    """Take grey frames for mosaics of a Bayer sensor whose file does not say so."""
+    """Take frames for mosaics of a Bayer sensor whose file does not say so, or names another pattern."""
     require(pattern in BAYER_CODES, f"bayer: expected one of {', '.join(BAYER_CODES)}, found {pattern!r}")
-    if len(source.file_shape) != 3 or source.bit_depth > 16:
-        kind = "floating point" if len(source.file_shape) == 3 else "colours"
+    grey = len(source.file_shape) == 3 or source.bayer is not None
+    if not grey or source.bit_depth > 16:
+        kind = "floating point" if grey else "colours"
         raise DataError(f"{source.name}: --bayer: expected grey frames of 8 or 16 bits, found {kind}; leave it out")
-    return dataclasses.replace(
-        source,
-        file_shape=(*source.file_shape, 3),
-        format=f"{source.format} as {pattern}",
-        develop=lambda pixels: demosaic(pixels, pattern),
-    )
+    shape = (*source.file_shape[:3], 3)
+    return dataclasses.replace(source, file_shape=shape, format=f"{source.format} as {pattern}", bayer=pattern)
 
 
 def _check_first(source: FrameSource) -> None:

@@ -177,7 +177,7 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
         pixels = pixels if before is None else before(pixels)
         if fill:
             pixels = fill_holes(pixels) if backdrop is None else backdrop.behind(pixels)
-        if source.develop is not None:
+        if source.bayer is not None:
             return with_planes(pixels, repair_stuck(planes_of(pixels), plane_places(stuck)))
         return repair_stuck(pixels, stuck) if len(stuck) else pixels
 
@@ -281,7 +281,7 @@ class _ContentScan:
         left_out |= (bright := overexposed(np.frombuffer(self._white), np.frombuffer(self._levels), ~left_out))
         stuck = self._stuck.found()
         rows, columns = self._source.window
-        if self._source.develop is not None:
+        if self._source.bayer is not None:
             stuck = mosaic_places(stuck) if len(stuck) else stuck
         else:
             stuck[:, 0] += rows.start
@@ -317,7 +317,7 @@ class _ContentScan:
         if not np.issubdtype(pixels.dtype, np.floating):
             return pixels
         missing = int(pixels.size - np.count_nonzero(np.isfinite(pixels)))
-        most = MOST_MISSING if self._source.develop is None else FEW_MISSING
+        most = MOST_MISSING if self._source.bayer is None else FEW_MISSING
         if missing > most * pixels.size:
             raise DataError(
                 f"{self._source.name}: frame {number}: expected finite values, found {missing} of {pixels.size} NaN or "

@@ -142,7 +142,7 @@ def turned_back(source: FrameSource, turned: frozenset[int]) -> FrameSource:
         for number, frame in zip(chosen, dataclasses.replace(whole, numbers=tuple(chosen)).native(), strict=True):
             yield _turn(frame, source.window) if number in turned else frame
 
-    return dataclasses.replace(source, pixels=pixels, repair=None, develop=None)
+    return dataclasses.replace(source, pixels=pixels, repair=None, bayer=None)
 
 
 def _turn(frame: PixelArray, window: Window) -> PixelArray:

@@ -62,12 +62,13 @@ def make_calibration(clip: FrameSource, dark: FrameSource | None, flat: FrameSou
         Frames to calibrate; its size counts before a region is selected.
     dark, flat : FrameSource or None
         Frames of the size of the clip. Those of FITS files that are scaled are compared with the clip by the values in
-        the files, others by their intensities.
+        the files; so are darks of another depth whose numbers are not spread over it, others by their intensities.
 
     Raises
     ------
     DataError
-        Another size, another full scale, a flat without light, or more than a tenth of the pixels hot or dead.
+        Another size, numbers beyond those of the clip, a flat without light, or more than a tenth of the pixels hot or
+        dead.
 
     Examples
     --------
@@ -157,31 +158,46 @@ def calibrated(clip: FrameSource, calibration: Calibration) -> FrameSource:
         pixels = pixels if before is None else before(pixels)
         if not np.issubdtype(pixels.dtype, np.floating):
             pixels = to_unit(pixels, clip.full_scale, clip.name)
-        return calibrate(pixels.astype(np.float32), calibration, mosaic=clip.develop is not None)
+        return calibrate(pixels.astype(np.float32), calibration, mosaic=clip.bayer is not None)
 
     return dataclasses.replace(clip, repair=repaired, warnings=(*clip.warnings, calibration.remark))
 
 
 def _as_sensor(source: FrameSource) -> FrameSource:
     """Take the mosaic of a Bayer sensor for grey frames: calibration comes before colour."""
-    if source.develop is None:
+    if source.bayer is None:
         return source
-    return dataclasses.replace(source, file_shape=source.file_shape[:3], develop=None)
+    return dataclasses.replace(source, file_shape=source.file_shape[:3], bayer=None)
 
 
 def _dark_level(clip: FrameSource, dark: FrameSource) -> FloatArray:
     """Average of the dark in intensities of the clip."""
     mean = _average(clip, dark)
     if clip.levels is None and dark.levels is None:
-        scales = {clip.full_scale, dark.full_scale}
-        if len(scales) > 1 and min(scales) > 1:
-            raise DataError(
-                f"{dark.name}: expected values up to {clip.full_scale} as in {clip.name}, found up to "
-                f"{dark.full_scale}; convert one of them"
-            )
-        return mean.astype(np.float32)
+        return (mean * _dark_scale(clip, dark)).astype(np.float32)
     black, white = (0, clip.full_scale) if clip.levels is None else clip.levels
     return (_values(dark, mean) / (white - black)).astype(np.float32)
+
+
+def _dark_scale(clip: FrameSource, dark: FrameSource) -> float:
+    """Full scale of a dark in that of the clip: 1, or the ratio of both where the same numbers mean the same light.
+
+    Programs store 12 bits in files of 16 either as they are or spread over the range.
+    """
+    low, high = sorted((clip, dark), key=lambda source: source.full_scale)
+    if low.full_scale in (1, high.full_scale):
+        return 1.0
+    (pixels,) = high.select((0, 1)).native()
+    ratio = high.full_scale / low.full_scale
+    for step in (ratio, round(ratio)):
+        if np.array_equal(np.rint(np.rint(pixels / step) * step), pixels):
+            return 1.0
+    if pixels.max() > low.full_scale:
+        raise DataError(
+            f"{high.name}: expected values up to {low.full_scale} as in {low.name}, or those spread over "
+            f"{high.full_scale}, found {pixels.max()}; convert one of them"
+        )
+    return dark.full_scale / clip.full_scale
 
 
 def _average(clip: FrameSource, source: FrameSource) -> NDArray[np.float64]:

@@ -155,7 +155,7 @@ def _source(
         warnings=(*notes, *remarks),
         levels=None if counts is None else counts.levels,
         header=image.cards,
-        develop=None if bayer is None else lambda mosaic: demosaic(mosaic, bayer),
+        bayer=bayer,
     )
 
 

@@ -29,7 +29,7 @@ from ...core.arrays import FloatArray, from_unit
 from ...core.errors import DataError
 from ..limits import DEFAULT_LIMITS, Limits, input_errors
 from ..output import atomic_output, frames_of_one_size
-from ..pixels import BAYER_REMARK, LEAST_SIDE, PixelArray, check_depth, demosaic, looks_like_bayer
+from ..pixels import BAYER_REMARK, LEAST_SIDE, PixelArray, check_depth, looks_like_bayer
 from ..source import FrameSource, check_cut_short
 
 SIGNATURE = b"LUCAM-RECORDER"
@@ -124,7 +124,7 @@ def open_ser(
         fps=None if times is None else (len(times) - 1) / float(times[-1]),
         timestamps=times,
         warnings=notes,
-        develop=None if pattern is None else lambda mosaic: demosaic(mosaic, pattern),
+        bayer=pattern,
     )
 
 
