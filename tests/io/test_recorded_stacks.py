@@ -10,6 +10,7 @@ from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.footage.checks.content import check_content
 from turbrestore.io.images.image_files import read_image, read_pixels
 from turbrestore.io.pixels import upright
+from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video
 from videos import refused, scene
 
@@ -27,6 +28,11 @@ class TestArrays:
         np.testing.assert_array_equal(np.rint(source.read() * 255), frames)
         (remark,) = source.warnings
         assert "(H, W, T)" in remark and "--axes thw" in remark
+
+    def test_an_array_in_memory_is_read_as_given_with_a_remark(self):
+        last = FrameSource.from_array(np.ascontiguousarray(np.moveaxis(STILL, 0, -1)))
+        assert last.shape == (40, 56, 14) and "np.moveaxis" in last.warnings[0]
+        assert FrameSource.from_array(STILL).warnings == FrameSource.from_array(COLOUR).warnings == ()
 
     @pytest.mark.parametrize(
         ("order", "axes"), [((0, 3, 1, 2), "(T, 3, H, W)"), ((1, 2, 3, 0), "(H, W, 3, T)")], ids=["TCHW", "HWCT"]

@@ -22,19 +22,14 @@ from ..core.arrays import CHANNELS, FloatArray, from_unit_to_type
 from ..core.errors import DataError, require
 from ..core.remarks import Doubt
 from ..runtime.scratch import iter_parts, new_stack
+from .axes import SAMPLES, frames_are_last
 from .counts import source_of_numbers
 from .limits import DEFAULT_LIMITS, Limits, check_input, format_errors, input_errors
 from .output import atomic_output, frames_of_one_size
-from .pixels import LEAST_SIDE
 from .source import FrameSource
 
 # Arrays of more bytes may be read to a scratch file.
 _LARGE = 1 << 22
-# Places along each axis at which the order of the axes is judged, and how much more alike planes must be to be taken
-# for the frames: those of 40 clips were more alike than the planes of their last axis, by a factor of 1.04 or more.
-_SAMPLES, _MORE_ALIKE = 48, 1.1
-# Planes of at most this share of the median contrast show nothing.
-_BLANK = 0.1
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -163,54 +158,11 @@ def _frames_first(path: Path, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
         for axis, order in ((3, "(T, H, W, 1)"), (1, "(T, 1, H, W)")):
             if shape[axis] == 1:
                 return np.squeeze(array, axis), order
-    if array.ndim == 3 and shape[2] in CHANNELS and min(shape[:2]) > _SAMPLES:
+    if array.ndim == 3 and shape[2] in CHANNELS and min(shape[:2]) > SAMPLES:
         raise DataError(f"{path}: expected frames of shape (T, H, W), found {shape}, which is that of one colour image")
-    if (
-        array.ndim == 3
-        and min(shape[:2]) >= LEAST_SIDE
-        and shape[2] > 1
-        # Only square frames make the last two axes, and no others, equally long.
-        and not shape[0] != shape[1] == shape[2]
-        and array.dtype.kind in "iuf"
-        and _frames_last(array)
-    ):
+    if frames_are_last(array):
         return np.moveaxis(array, 2, 0), "(H, W, T)"
     return array, ""
-
-
-def _frames_last(array: NDArray[Any]) -> bool:
-    """Whether the planes of the last axis resemble each other more than those of the first, whatever their light."""
-    places = [np.unique(np.linspace(0, length - 1, _SAMPLES).astype(int)) for length in array.shape]
-    # Whole planes of the last axis would read the whole file.
-    block = np.asarray(array[places[0]][:, places[1]][:, :, places[2]], np.float64)
-    if not np.isfinite(block).all():
-        return False
-    block = _without_blank_planes(block)
-    # Light that changes makes rows of all frames alike; planes along either axis are brought to the same level.
-    for axis in (0, 2, 0, 2):
-        level = np.abs(block.mean(axis=tuple(other for other in range(3) if other != axis), keepdims=True))
-        block = block / np.maximum(level, np.finfo(float).tiny)
-    # Square frames at the end make the first two axes, and no others, equally long.
-    factor = 1.0 if array.shape[0] == array.shape[1] != array.shape[2] else _MORE_ALIKE
-    return _likeness(block, 2) > factor * _likeness(block, 0)
-
-
-def _likeness(block: NDArray[np.float64], axis: int) -> float:
-    """Root of the mean correlation of two planes along an axis."""
-    planes = np.moveaxis(block, axis, 0).reshape(block.shape[axis], -1)
-    planes = planes - planes.mean(axis=1, keepdims=True)
-    norms = np.linalg.norm(planes, axis=1, keepdims=True)
-    return float(np.linalg.norm((planes / np.maximum(norms, np.finfo(float).tiny)).mean(axis=0)))
-
-
-def _without_blank_planes(block: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Leave out planes of the first and the last axis that show nothing: a blank frame changes more than any scene."""
-    for axis in (0, 2):
-        contrasts = block.std(axis=tuple(other for other in range(3) if other != axis))
-        block = np.asarray(np.compress(contrasts > _BLANK * np.median(contrasts), block, axis=axis), np.float64)
-        if min(block.shape) < 2:
-            return np.zeros((2, 2, 2))
-    return block
 
 
 def write_npy(path: Path, frames: Iterable[FloatArray], bit_depth: int = 32, overwrite: bool = False) -> None:

@@ -21,6 +21,7 @@ from ..core.arrays import CHANNELS, FloatArray, as_array
 from ..core.errors import ConfigurationError, DataError, require
 from ..core.remarks import Doubt, counted
 from ..runtime.scratch import iter_frames
+from .axes import frames_are_last
 from .output import size_text
 from .pixels import PixelArray, demosaic, depth_of, full_scale_of, to_unit
 
@@ -280,7 +281,8 @@ class FrameSource:
     def from_array(array: ArrayLike, name: str = "array", fps: float | None = None) -> FrameSource:
         """Use an array in memory, a memory-mapped file, or an array that is computed or read on demand, as a video.
 
-        Arrays of Dask, xarray, Zarr and HDF5 are read frame by frame, while iterating; chunks of one frame are best.
+        Arrays of Dask, xarray, Zarr and HDF5 are read frame by frame, while iterating; chunks of one frame are best.  A
+        warning says where an array in memory looks like (H, W, T).
 
         Parameters
         ----------
@@ -301,6 +303,7 @@ class FrameSource:
         known = isinstance(getattr(array, "dtype", None), np.dtype)
         values: Any = array if known else as_array(array, name, "turbrestore.open_frames")
         dtype = np.dtype(values.dtype)
+        doubt = Doubt("the last of its axes looks like time: np.moveaxis(frames, -1, 0) makes it the first")
         return FrameSource(
             name=name,
             format=f"array/{dtype}",
@@ -309,6 +312,7 @@ class FrameSource:
             bit_depth=depth_of(dtype),
             pixels=lambda chosen: (np.asanyarray(values[number]) for number in chosen),
             fps=fps,
+            warnings=(doubt,) if isinstance(values, np.ndarray) and frames_are_last(values) else (),
         )
 
     def _window(self, roi: Roi | None) -> tuple[slice, slice]:
