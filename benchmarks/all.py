@@ -58,6 +58,7 @@ TABLES = {
     "oracles": Table("oracles.py"),
     "outliers": Table("outliers.py"),
     "guards": Table("guards.py"),
+    "smooth_noise": Table("smooth_noise.py"),
     "blur": Table("blur.py"),
     "registration": Table("registration.py"),
     "steady": Table("steady.py reported"),

@@ -184,10 +184,11 @@ def fitted_blur(image: FloatArray, truth: FloatArray) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class TrainingClips:
-    """Features (n, f), width (n,), and visible gain, dB, by every one of WIDTHS (n, w) and by the true blur (n,)."""
+    """Features (n, f), widths by the image alone and true ones (n,), gains, dB, by WIDTHS (n, w) and the truth (n,)."""
 
     simulators: np.ndarray
     features: np.ndarray
+    alone: np.ndarray
     width: np.ndarray
     gains: np.ndarray
     right: np.ndarray
@@ -208,6 +209,7 @@ def read_clips(folder: Path) -> TrainingClips:
     return TrainingClips(
         np.array([clip["simulator"] for clip in held]),
         np.array([blur_features(*clip["read"]) for clip in held]),
+        np.array([clip["read"][4].estimate.sigma for clip in held]),
         np.maximum([clip["width"] for clip in held], WIDTHS[1]),
         gains[:, :-1],
         gains[:, -1],
@@ -293,7 +295,8 @@ def table_of(clips: TrainingClips) -> str:
         held = clips.simulators == name
         weights = train_networks(clips, ~held)
         found |= {
-            place: learnt_blur(clips.features[place], clips.posterior[place], weights) for place in np.flatnonzero(held)
+            place: learnt_blur(clips.features[place], clips.posterior[place], clips.alone[place], weights)
+            for place in np.flatnonzero(held)
         }
         lines.append(_row(name, clips, held, found))
     every = np.ones(len(folds), bool)
@@ -302,7 +305,7 @@ def table_of(clips: TrainingClips) -> str:
     for fold in range(5):
         weights = train_networks(clips, folds != fold)
         found |= {
-            place: learnt_blur(clips.features[place], clips.posterior[place], weights)
+            place: learnt_blur(clips.features[place], clips.posterior[place], clips.alone[place], weights)
             for place in np.flatnonzero(folds == fold)
         }
     for name in sorted(set(clips.simulators)):

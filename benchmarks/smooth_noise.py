@@ -2,9 +2,7 @@
 
     python benchmarks/smooth_noise.py
 
-PSNR, dB, of the mean, of the filtered image and of the result, after the best gain and offset, and that of the filtered
-image behind the Wiener filter that is made of its own spectrum and that of the scene.  Exit code 1 if a result gains
-less than half of what that gains over the mean.
+Exit code 1 if a result gains less than half of what the Wiener filter gains over the mean.
 """
 
 from __future__ import annotations
@@ -16,6 +14,7 @@ from functools import partial
 import cv2
 import numpy as np
 from blur_clips import h264, part_of
+from provenance import publish_printed
 
 from turbrestore.core.arrays import FloatArray, luminance
 from turbrestore.io.source import FrameSource
@@ -29,6 +28,12 @@ from turbrestore.synthesis.sequence import CameraParams
 
 COUNT, SIDE, BORDER = 36, 192, 12
 LEAST_SHARE = 0.5
+HEAD = """# Noise that is smooth in space
+Printed by `python benchmarks/smooth_noise.py`.
+
+PSNR, dB, of the mean, of the filtered image and of the result, after the best gain and offset, and that of the filtered
+image behind the Wiener filter that is made of its own spectrum and of that of the scene; share of the gain of the last
+over the mean that the result has."""
 
 
 def smooth(frames: FloatArray, rng: np.random.Generator, width: float, noise: float) -> FloatArray:
@@ -106,4 +111,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(publish_printed(HEAD, main))

@@ -27,16 +27,16 @@ def peak_at(factor, height=2.0):
     return np.where(FACTORS > 0, height - 8 * np.log(np.maximum(FACTORS, 0.1) / factor) ** 2, 0.0)
 
 
-def blur_of(weights, low=1.0, usual=1.0):
-    """What networks say where these are the 16 % and the 50 % quantile of the posterior."""
-    return learnt_blur(np.zeros(FEATURES), np.array([low, usual, 2 * usual]), weights)
+def blur_of(weights, low=1.0, usual=1.0, alone=1.0):
+    """What networks say where these are two quantiles of the posterior and the width by the image alone."""
+    return learnt_blur(np.zeros(FEATURES), np.array([low, usual, 2 * usual]), alone, weights)
 
 
 def test_the_widest_blur_of_the_largest_gain_is_chosen_up_to_its_width():
     # Gains are interpolated linearly between 0.8 and 0.9, where the parabola has fallen by 0.111 dB.
     for factor, width, expected in ((0.8, 2.0, 0.845), (0.8, 0.82, 0.82), (1.35, 1.0, 1.35)):
         found = blur_of(networks_of(np.log(width), np.log(0.2), peak_at(factor)), low=1.0, usual=1.7)
-        assert found.removed**2 == pytest.approx(1.7 * expected, rel=0.012)
+        assert found.removed**2 == pytest.approx((1.7 * expected) ** (7 / 8), rel=0.012)
         np.testing.assert_allclose(found.width, 1.7 * width * np.exp(0.2 * np.array([-1, 0, 1])))
 
 
@@ -45,15 +45,16 @@ def test_a_gain_that_peaks_between_the_widths_tried_is_not_missed():
     assert blur_of(networks_of(0.0, -1.0, gains)).removed == pytest.approx(1.0, rel=0.01)
 
 
-def test_the_geometric_mean_with_the_low_width_of_the_posterior_is_removed():
+def test_the_geometric_mean_of_three_widths_is_removed():
     weights = networks_of(0.0, -1.0, peak_at(1.0))
-    wide, narrow = (blur_of(weights, low=low).removed for low in (1.0, 0.81))
-    assert narrow / wide == pytest.approx(0.9)
+    wide, low, alone = (blur_of(weights, *widths).removed for widths in ((1, 1, 1), (0.81, 1, 1), (1, 1, 1.5)))
+    assert low / wide == pytest.approx(0.9 ** (7 / 8))
+    assert alone / wide == pytest.approx(1.5 ** (1 / 8))
 
 
 def test_nothing_is_removed_where_a_loss_is_expected():
-    # The mean of 1 and 0.36 is 0.6, where the parabola has fallen by 8 ln² 0.6 = 2.1 dB.
-    for height, low, removed in ((2.2, 0.36, 0.6), (1.9, 0.36, 0.0), (1.9, 1.0, 1.0), (-0.2, 1.0, 0.0)):
+    # The mean of 1, 0.31 and 1 is 0.6, where the parabola has fallen by 8 ln² 0.6 = 2.1 dB.
+    for height, low, removed in ((2.2, 0.311, 0.6), (1.9, 0.311, 0.0), (1.9, 1.0, 1.0), (-0.2, 1.0, 0.0)):
         found = blur_of(networks_of(0.0, -1.0, peak_at(1.0, height)), low=low)
         assert found.removed == pytest.approx(removed, rel=0.03)
 
@@ -86,15 +87,15 @@ def test_layers_are_those_of_a_perceptron():
         w1, w2, w3 = (weights[f"w{layer}"][number] for layer in (1, 2, 3))
         b1, b2, b3 = (weights[f"b{layer}"][number] for layer in (1, 2, 3))
         logs.append((w3 @ silu(w2 @ silu(w1 @ (x - weights["middle"]) + b1) + b2) + b3)[0])
-    assert np.log(learnt_blur(x, np.ones(3), weights).width[1]) == pytest.approx(np.mean(logs))
+    assert np.log(learnt_blur(x, np.ones(3), 1.0, weights).width[1]) == pytest.approx(np.mean(logs))
 
 
 def test_what_is_not_known_is_taken_for_usual():
     weights = networks_of(0.0, -1.0, peak_at(1.0))
     weights["w1"][:] = weights["w2"][:] = weights["w3"][:] = 0.3
     weights["middle"] = np.arange(FEATURES, dtype=float)
-    known = learnt_blur(weights["middle"], np.ones(3), weights)
-    unknown = learnt_blur(np.full(FEATURES, np.nan), np.ones(3), weights)
+    known = learnt_blur(weights["middle"], np.ones(3), 1.0, weights)
+    unknown = learnt_blur(np.full(FEATURES, np.nan), np.ones(3), 1.0, weights)
     np.testing.assert_array_equal(known.width, unknown.width)
 
 

@@ -140,8 +140,8 @@ def test_networks_get_the_quantiles_of_the_posterior_and_its_shape_is_removed(mo
     frames, flows = still_clip(cv2.GaussianBlur(SCENES["camera"](128, 128), (0, 0), 1.5))
     image, given = frames.mean(axis=0), []
 
-    def learnt(_features, widths):
-        given.append(widths)
+    def learnt(_features, widths, alone):
+        given.extend([widths, alone])
         return LearntBlur(np.array([1.0, 1.2, 1.4]), 1.1)
 
     monkeypatch.setattr("turbrestore.blur.posterior.learnt_blur", learnt)
@@ -149,6 +149,7 @@ def test_networks_get_the_quantiles_of_the_posterior_and_its_shape_is_removed(mo
     evidence, found = estimate_posterior(image, witnesses, white_noise(0.001), exponent=exponent)
     by_theory = blur_posterior(evidence, witnesses, witnesses.variation.with_power(image))
     np.testing.assert_array_equal(given[0], by_theory.width)
+    assert given[1] == evidence.estimate.sigma
     assert found.removed == 1.1 and found.width.tolist() == [1.0, 1.2, 1.4]
     assert found.exponent == (exponent or by_theory.exponent)
 

@@ -16,9 +16,10 @@ widths; widths are relative to that of the posterior, which is about right at ev
 scatter adds to the deviation.  Of the widths whose G is as good as the largest, but for a difference that is not seen,
 the widest is chosen that is no wider than σ or than the best.
 
-What is removed is the geometric mean of that width and σ_16, or nothing where G expects a loss from it.  The networks
-know more simulators than the theory of the posterior, and are wrong where a clip is like none of them; the posterior
-errs elsewhere.  ``benchmarks/decisions/blur.md`` compares the mean with either.
+What is removed is a geometric mean of that width, of σ_16 and, with a small share, of the width that the image alone
+tells, or nothing where G expects a loss from it.  The networks know more simulators than the theory of the posterior,
+and are wrong where a clip is like none of them; the posterior errs elsewhere.  The image alone is right about text and
+charts, and takes soft scenes for blurred ones.  ``benchmarks/decisions/blur.md`` compares the mean with each of them.
 
 ``python benchmarks/blur_training.py`` makes the clips, trains and judges the networks, and writes ``learnt_blur.npz``.
 """
@@ -38,7 +39,7 @@ from ..core.arrays import ROUNDING, FloatArray
 from ..core.noise_spectrum import NoiseSpectrum
 from .psf import Float64Array
 from .witnesses.image_evidence import ImageEvidence
-from .witnesses.spectral_variation import RINGS, SIDE, SpectralVariation, window_power
+from .witnesses.spectral_variation import RINGS, SIDE, SpectralVariation, window_power, window_weights
 
 # Grid of G: widths relative to that of the posterior, the first of which is no blur.
 FACTORS: Float64Array = np.array([0, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.35, 1.6, 2.0, 2.6])
@@ -55,8 +56,8 @@ LOG_SPREADS = (-3.0, 1.0)
 FARTHEST = 4.0
 # Reductions at which gradients are read; the shortest side that they leave has as many pixels as the largest.
 _SCALES = (1, 2, 4, 8)
-# Mean of the squared window of SIDE pixels along both axes.
-_PROFILE = 9 / 64
+# Share of the width by the image alone, by cross-validation.
+_ALONE = 1 / 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +86,7 @@ def blur_features(
     """
     air, exponent, displacement, frames = facts
     unknown = np.full(len(_PICKED), np.nan)
-    of_noise = noise.at(RINGS) * _PROFILE * SIDE**2
+    of_noise = noise.at(RINGS) * float(np.square(window_weights()).sum())
     power = _spectrum(image)
     rows = [
         _log(np.ravel(widths), 0.05),
@@ -117,9 +118,15 @@ def blur_features(
 
 
 def learnt_blur(
-    features: Float64Array, widths: Float64Array, weights: Mapping[str, NDArray[np.floating]] | None = None
+    features: Float64Array,
+    widths: Float64Array,
+    alone: float,
+    weights: Mapping[str, NDArray[np.floating]] | None = None,
 ) -> LearntBlur:
-    """Evaluate the networks of the package, or others; ``widths`` (3,) are the quantiles of the posterior, pixels."""
+    """Evaluate the networks of the package, or others.
+
+    ``widths`` (3,) are the quantiles of the posterior, and ``alone`` is the width by the image alone, pixels.
+    """
     weights = _weights() if weights is None else weights
     # What is not known is taken for usual.
     x = np.clip(np.nan_to_num((features - weights["middle"]) / weights["scale"]), -FARTHEST, FARTHEST)
@@ -133,7 +140,8 @@ def learnt_blur(
     quantiles = usual * np.exp(out[:, 0].mean() + spread * np.array([-1.0, 0.0, 1.0]))
     gains = out[:, 2:].mean(axis=0)
     gains = gains - gains[0]
-    removed = (usual * _widest(gains, float(quantiles[1]) / usual) * low) ** 0.5
+    together = (usual * _widest(gains, float(quantiles[1]) / usual) * low) ** 0.5
+    removed = together ** (1 - _ALONE) * alone**_ALONE
     return LearntBlur(quantiles, removed if np.interp(removed / usual, FACTORS, gains) >= 0 else 0.0)
 
 

@@ -114,7 +114,7 @@ def measure_variation(
         return None
     response = np.mean(responses, axis=0)
     # Means of pixels keep the power of the noise for each area, and spectra here are not normalised.
-    smooth_noise = noise.certain.at(RINGS / reduction) / reduction**2 * np.square(_profile()).sum()
+    smooth_noise = noise.certain.at(RINGS / reduction) / reduction**2 * np.square(window_weights()).sum()
     white_noise = response * float(np.median((np.mean(sums, axis=0)[0] / response)[-_NOISE_RINGS:]))
     power = np.maximum(np.maximum(white_noise, smooth_noise), _LEAST_NOISE)
     return _ratios(np.array(sums), power, len(picked), float(np.mean(stretches)), reduction)
@@ -182,12 +182,12 @@ def _transform(window: FloatArray) -> NDArray[np.complex64]:
 
 
 def _windowed(part: FloatArray) -> FloatArray:
-    return (part - part.mean()) * _profile()
+    return (part - part.mean()) * window_weights()
 
 
 @functools.cache
-def _profile() -> FloatArray:
-    """Weights of a window, which fall to zero beyond it."""
+def window_weights() -> FloatArray:
+    """Weights (SIDE, SIDE) of a window, which fall to zero beyond it."""
     profile = np.hanning(SIDE + 2)[1:-1].astype(np.float32)
     return np.outer(profile, profile)
 
