@@ -209,7 +209,7 @@ def read_clips(folder: Path) -> TrainingClips:
     return TrainingClips(
         np.array([clip["simulator"] for clip in held]),
         np.array([blur_features(*clip["read"]) for clip in held]),
-        np.array([clip["read"][4].estimate.sigma for clip in held]),
+        np.array([one.sigma * one.blurred for one in (clip["read"][4].estimate for clip in held)]),
         np.maximum([clip["width"] for clip in held], WIDTHS[1]),
         gains[:, :-1],
         gains[:, -1],
@@ -294,24 +294,25 @@ def table_of(clips: TrainingClips) -> str:
     for name in sorted(set(clips.simulators)):
         held = clips.simulators == name
         weights = train_networks(clips, ~held)
-        found |= {
-            place: learnt_blur(clips.features[place], clips.posterior[place], clips.alone[place], weights)
-            for place in np.flatnonzero(held)
-        }
+        found |= _found(clips, held, weights)
         lines.append(_row(name, clips, held, found))
     every = np.ones(len(folds), bool)
     lines.append(_row("each", clips, every, found))
     found = {}
     for fold in range(5):
         weights = train_networks(clips, folds != fold)
-        found |= {
-            place: learnt_blur(clips.features[place], clips.posterior[place], clips.alone[place], weights)
-            for place in np.flatnonzero(folds == fold)
-        }
+        found |= _found(clips, folds == fold, weights)
     for name in sorted(set(clips.simulators)):
         lines.append(_row(f"a fifth, {name}", clips, clips.simulators == name, found))
     lines.append(_row("a fifth", clips, every, found))
     return "\n".join(lines) + "\n"
+
+
+def _found(clips: TrainingClips, held: np.ndarray, weights: dict[str, np.ndarray]) -> dict[int, LearntBlur]:
+    return {
+        place: learnt_blur(clips.features[place], clips.posterior[place], clips.alone[place], weights)
+        for place in np.flatnonzero(held)
+    }
 
 
 def _row(title: str, clips: TrainingClips, held: np.ndarray, found: dict[int, LearntBlur]) -> str:

@@ -33,6 +33,8 @@ _LABELS = {
     "--derotate": "Turn a planet back",
     "--hdr keep": "the option hdr of the command line",
     "--frames": "Frames",
+    "try --bayer": "under Bayer pattern of a raw clip, choose",
+    " or --bayer": " or",
     "--bayer": "Bayer pattern of a raw clip",
     "--sigma": "Width",
     "--scale": "Grid of the result",

@@ -52,6 +52,11 @@ def test_the_geometric_mean_of_three_widths_is_removed():
     assert alone / wide == pytest.approx(1.5 ** (1 / 8))
 
 
+def test_an_image_that_tells_no_blur_does_not_count():
+    weights = networks_of(0.0, -1.0, peak_at(1.0))
+    assert blur_of(weights, low=0.81, alone=0.0).removed == pytest.approx(0.9, rel=0.01)
+
+
 def test_nothing_is_removed_where_a_loss_is_expected():
     # The mean of 1, 0.31 and 1 is 0.6, where the parabola has fallen by 8 ln² 0.6 = 2.1 dB.
     for height, low, removed in ((2.2, 0.311, 0.6), (1.9, 0.311, 0.0), (1.9, 1.0, 1.0), (-0.2, 1.0, 0.0)):

@@ -109,12 +109,36 @@ def test_twelve_bits_in_files_of_sixteen(stored, wider):
     np.testing.assert_allclose(source.read(), SCENE * GAIN * brightness, atol=6e-4)
 
 
+@pytest.mark.parametrize("case", ["the mean of darks", "eight bits", "no light"])
+def test_darks_of_another_depth_that_may_mean_either_are_refused(case):
+    rng = np.random.default_rng(0)
+    clip = FrameSource.from_array(np.uint16(rng.integers(200, 3000, (4, *SHAPE))), "clip")
+    clip = replace(clip, full_scale=4095, bit_depth=12)
+    dark = np.uint16(rng.integers(0, 200, (5, *SHAPE)))
+    if case == "the mean of darks":
+        dark = np.uint16(16 * dark.mean(axis=0, keepdims=True))
+    elif case == "eight bits":
+        clip = FrameSource.from_array(np.uint8(rng.integers(20, 200, (4, *SHAPE))), "clip")
+    else:
+        dark[:] = 0
+    with pytest.raises(DataError, match="convert one of the two"):
+        make_calibration(clip, FrameSource.from_array(dark, "dark"), None)
+
+
+def test_a_black_frame_does_not_tell_how_values_are_stored():
+    frames = np.rint(np.tile(OFFSET * 4095, (5, 1, 1)))
+    dark = replace(FrameSource.from_array(np.uint16(frames), "dark"), full_scale=4095, bit_depth=12)
+    clip = np.uint16(np.concatenate([np.zeros((1, *SHAPE)), np.rint((SCENE * GAIN + OFFSET) * 4095)]))
+    found = make_calibration(FrameSource.from_array(clip, "clip"), dark, None)
+    np.testing.assert_allclose(found.dark, OFFSET * 4095 / 65535, atol=1e-5)
+
+
 def test_what_does_not_fit_is_refused():
     clip = sources()[0]
     other = FrameSource.from_array(np.zeros((1, 4, 4)), "other")
     for words, arguments in {
         "expected 30×24 grey as in clip, found 4×4 grey": (clip, other, None),
-        "expected values up to 255 as in d, or those spread over 65535": (
+        "expected some frames of values up to 255 as in d, or of those spread over 65535": (
             clip,
             FrameSource.from_array(np.zeros((1, *SHAPE), np.uint8), "d"),
             None,

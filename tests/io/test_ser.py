@@ -9,6 +9,7 @@ import pytest
 from turbrestore.core.errors import ConfigurationError, DataError, OutputError, TurbrestoreError
 from turbrestore.footage.checks.content import check_content, clean_source
 from turbrestore.io.astronomy.ser import read_ser_header, write_ser
+from turbrestore.io.pixels import doubted_pattern
 from turbrestore.io.video import open_frames
 
 MONO = np.arange(2 * 3 * 4).reshape(2, 3, 4)
@@ -254,20 +255,20 @@ class TestMosaics:
         source = open_frames(ser(mosaic, colour=given))
         # Red and blue may be exchanged without a trace.
         alike = (right in (9, 10)) == (given in (9, 10))
-        assert alike == (source.warnings == ())
-        if not alike:
-            other = " or ".join(
-                name for name in ("rggb", "bggr", "grbg", "gbrg") if (name[0] == "g") == (right in (9, 10))
-            )
-            assert all(
-                "--bayer" in warning and name in warning for warning in source.warnings for name in other.split(" or ")
-            )
+        better = "grbg or --bayer gbrg" if right in (9, 10) else "rggb or --bayer bggr"
+        doubt = f"the greens of the Bayer pattern {colours[given]} are unlike: try --bayer {better}"
+        assert source.warnings == (() if alike else (doubt,))
         replaced = open_frames(ser(mosaic, colour=given), bayer=colours[right])
         assert replaced.warnings == ()
         np.testing.assert_array_equal(replaced.read(), open_frames(ser(mosaic, colour=right)).read())
 
-    def test_greys_have_no_pattern_to_doubt(self, ser):
-        assert open_frames(ser(moon_like(), colour=8)).warnings == ()
+    @pytest.mark.parametrize("pattern", ["rggb", "grbg"])
+    def test_a_right_pattern_is_not_doubted(self, pattern):
+        y, x = np.mgrid[:64, :64]
+        ramp, rng = (x + y) / 128, np.random.default_rng(0)
+        damaged = np.where((x == 9) & (y == 9), np.nan, ramp)
+        for mosaic in (ramp, damaged, 0.5 + 0.1 * rng.standard_normal(x.shape), np.full(x.shape, np.nan)):
+            assert doubted_pattern(mosaic, pattern) == ()
 
     def test_colour_is_no_mosaic(self, ser):
         refused(ser(np.tile(self.mosaic()[..., None], 3), colour=100), DataError, "--bayer", bayer="rggb")

@@ -8,8 +8,7 @@ x : what the witnesses say, standardised: widths by every witness and by their p
 σ, p : width and exponent of the transfer function of the image; see :func:`turbrestore.blur.psf.blur_otf`
 σ_16 : width that, by the posterior, is exceeded with a probability of 84 %
 G : gain, decibels, by which the visible error ``e² + e_0²`` falls where a blur of some width is removed, whose exponent
-    is that of the posterior, or 1.3 if that is less; e² is the mean squared error, and e_0² that of 38 dB, below which
-    no error is seen
+    is that of the posterior; e² is the mean squared error, and e_0² that of 38 dB, below which no error is seen
 
 A few small networks, trained alike from different starts, map x to ln σ with its deviation, and to G on a grid of
 widths; widths are relative to that of the posterior, which is about right at every scale.  Their mean counts, and their
@@ -17,9 +16,9 @@ scatter adds to the deviation.  Of the widths whose G is as good as the largest,
 the widest is chosen that is no wider than σ or than the best.
 
 What is removed is a geometric mean of that width, of σ_16 and, with a small share, of the width that the image alone
-tells, or nothing where G expects a loss from it.  The networks know more simulators than the theory of the posterior,
-and are wrong where a clip is like none of them; the posterior errs elsewhere.  The image alone is right about text and
-charts, and takes soft scenes for blurred ones.  ``benchmarks/decisions/blur.md`` compares the mean with each of them.
+tells, if it tells one; or nothing where G expects a loss from it.  The networks know more simulators than the theory of
+the posterior, and are wrong where a clip is like none of them; the posterior errs elsewhere.  The image alone is right
+about text and charts, and takes soft scenes for blurred ones.  ``benchmarks/decisions/blur.md`` compares them.
 
 ``python benchmarks/blur_training.py`` makes the clips, trains and judges the networks, and writes ``learnt_blur.npz``.
 """
@@ -125,7 +124,8 @@ def learnt_blur(
 ) -> LearntBlur:
     """Evaluate the networks of the package, or others.
 
-    ``widths`` (3,) are the quantiles of the posterior, and ``alone`` is the width by the image alone, pixels.
+    ``widths`` (3,) are the quantiles of the posterior, and ``alone`` is the width by the image alone, pixels; 0 where
+    it finds no blur.
     """
     weights = _weights() if weights is None else weights
     # What is not known is taken for usual.
@@ -141,7 +141,7 @@ def learnt_blur(
     gains = out[:, 2:].mean(axis=0)
     gains = gains - gains[0]
     together = (usual * _widest(gains, float(quantiles[1]) / usual) * low) ** 0.5
-    removed = together ** (1 - _ALONE) * alone**_ALONE
+    removed = together ** (1 - _ALONE) * (alone or together) ** _ALONE
     return LearntBlur(quantiles, removed if np.interp(removed / usual, FACTORS, gains) >= 0 else 0.0)
 
 

@@ -140,7 +140,8 @@ def estimate_posterior(
     widths = [by_theory.by_displacement, by_theory.by_variation, by_theory.by_image, by_theory.width]
     facts = by_theory.air, by_theory.exponent, witnesses.displacement, witnesses.independent_frames
     features = blur_features(image, np.array(widths), variation, ratio, evidence, noise, facts)
-    found, shape = learnt_blur(features, by_theory.width, evidence.estimate.sigma), exponent or by_theory.exponent
+    alone = evidence.estimate.sigma if evidence.estimate.blurred else 0.0
+    found, shape = learnt_blur(features, by_theory.width, alone), exponent or by_theory.exponent
     return evidence, replace(by_theory, removed=found.removed, exponent=shape, width=found.width)
 
 

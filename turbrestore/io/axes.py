@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..core.arrays import CHANNELS
 from .pixels import LEAST_SIDE
 
 # Places along each axis at which the order of the axes is judged, and how much more alike planes must be to be taken
@@ -19,11 +20,20 @@ SAMPLES, _MORE_ALIKE = 48, 1.1
 _BLANK = 0.1
 
 
-def frames_are_last(array: NDArray[Any]) -> bool:
-    """Whether the planes of the last of three axes resemble each other more than those of the first."""
+def frames_are_last(array: NDArray[Any], certain: bool = False) -> bool:
+    """Whether the planes of the last of three axes resemble each other more than those of the first.
+
+    Unless one is to be ``certain``, that square planes are at the end counts as well.
+    """
     shape = array.shape
     # Only square frames make the last two axes, and no others, equally long.
-    if len(shape) != 3 or shape[2] < 2 or min(shape[:2]) < LEAST_SIDE or shape[0] != shape[1] == shape[2]:
+    if (
+        len(shape) != 3
+        or shape[2] < 2
+        or (certain and shape[2] in CHANNELS)
+        or min(shape[:2]) < LEAST_SIDE
+        or shape[0] != shape[1] == shape[2]
+    ):
         return False
     if array.dtype.kind not in "iuf":
         return False
@@ -37,7 +47,7 @@ def frames_are_last(array: NDArray[Any]) -> bool:
         level = np.abs(block.mean(axis=tuple(other for other in range(3) if other != axis), keepdims=True))
         block = block / np.maximum(level, np.finfo(float).tiny)
     # Square frames at the end make the first two axes, and no others, equally long.
-    factor = 1.0 if array.shape[0] == array.shape[1] != array.shape[2] else _MORE_ALIKE
+    factor = 1.0 if shape[0] == shape[1] != shape[2] and not certain else _MORE_ALIKE
     return _likeness(block, 2) > factor * _likeness(block, 0)
 
 

@@ -312,7 +312,7 @@ class FrameSource:
             bit_depth=depth_of(dtype),
             pixels=lambda chosen: (np.asanyarray(values[number]) for number in chosen),
             fps=fps,
-            warnings=(doubt,) if isinstance(values, np.ndarray) and frames_are_last(values) else (),
+            warnings=(doubt,) if isinstance(values, np.ndarray) and frames_are_last(values, certain=True) else (),
         )
 
     def _window(self, roi: Roi | None) -> tuple[slice, slice]:

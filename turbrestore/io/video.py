@@ -45,7 +45,7 @@ from .images.tiff import TIFF_SUFFIXES, open_tiff, write_tiff
 from .limits import DEFAULT_LIMITS, Limits, check_input, content_suffix, input_errors
 from .npy import open_npy, write_npy
 from .output import check_output
-from .pixels import BAYER_CODES, check_depth, doubted_pattern, to_unit
+from .pixels import BAYER_CODES, BAYER_REMARK, check_depth, doubted_pattern, to_unit
 from .source import FrameRange, FrameSource, Roi, numbers_text, to_slice
 
 VIDEO_SUFFIXES = (*CONTAINER_SUFFIXES, ".ser", *TIFF_SUFFIXES, ".npy", *ANIMATION_SUFFIXES, *FITS_SUFFIXES)
@@ -252,12 +252,16 @@ def _suffix_of(path: Path) -> str:
 def _as_bayer(source: FrameSource, pattern: str) -> FrameSource:
     """Take frames for mosaics of a Bayer sensor whose file does not say so, or names another pattern."""
     require(pattern in BAYER_CODES, f"bayer: expected one of {', '.join(BAYER_CODES)}, found {pattern!r}")
-    grey = len(source.file_shape) == 3 or source.bayer is not None
-    if not grey or source.bit_depth > 16:
-        kind = "floating point" if grey else "colours"
+    if source.bayer is None and (len(source.file_shape) != 3 or source.bit_depth > 16):
+        kind = "floating point" if len(source.file_shape) == 3 else "colours"
         raise DataError(f"{source.name}: --bayer: expected grey frames of 8 or 16 bits, found {kind}; leave it out")
-    shape = (*source.file_shape[:3], 3)
-    return dataclasses.replace(source, file_shape=shape, format=f"{source.format} as {pattern}", bayer=pattern)
+    return dataclasses.replace(
+        source,
+        file_shape=(*source.file_shape[:3], 3),
+        format=f"{source.format.split(' as ')[0]} as {pattern}",
+        warnings=tuple(remark for remark in source.warnings if remark != BAYER_REMARK),
+        bayer=pattern,
+    )
 
 
 def _check_first(source: FrameSource) -> None:

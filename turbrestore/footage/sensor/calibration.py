@@ -62,13 +62,15 @@ def make_calibration(clip: FrameSource, dark: FrameSource | None, flat: FrameSou
         Frames to calibrate; its size counts before a region is selected.
     dark, flat : FrameSource or None
         Frames of the size of the clip. Those of FITS files that are scaled are compared with the clip by the values in
-        the files; so are darks of another depth whose numbers are not spread over it, others by their intensities.
+        the files, others by their intensities. Darks of another depth are compared by their values, or by their
+        intensities where they have only those that values of the smaller depth, spread over the larger, become; some
+        frames tell that, and one does not.
 
     Raises
     ------
     DataError
-        Another size, numbers beyond those of the clip, a flat without light, or more than a tenth of the pixels hot or
-        dead.
+        Another size, another depth that the values do not explain, a flat without light, or more than a tenth of the
+        pixels hot or dead.
 
     Examples
     --------
@@ -182,20 +184,22 @@ def _dark_level(clip: FrameSource, dark: FrameSource) -> FloatArray:
 def _dark_scale(clip: FrameSource, dark: FrameSource) -> float:
     """Full scale of a dark in that of the clip: 1, or the ratio of both where the same numbers mean the same light.
 
-    Programs store 12 bits in files of 16 either as they are or spread over the range.
+    Programs store 12 bits in files of 16 either as they are or spread over the range.  The mean of many frames has all
+    numbers, so a single one does not tell.
     """
     low, high = sorted((clip, dark), key=lambda source: source.full_scale)
     if low.full_scale in (1, high.full_scale):
         return 1.0
-    (pixels,) = high.select((0, 1)).native()
+    frames = [next(high.select((place, place + 1)).native()) for place in sorted({0, len(high) // 2, len(high) - 1})]
+    lit = np.concatenate([frame[frame > 0] for frame in frames])
     ratio = high.full_scale / low.full_scale
-    for step in (ratio, round(ratio)):
-        if np.array_equal(np.rint(np.rint(pixels / step) * step), pixels):
-            return 1.0
-    if pixels.max() > low.full_scale:
+    if lit.size and any(np.array_equal(np.rint(np.rint(lit / step) * step), lit) for step in (ratio, round(ratio))):
+        return 1.0
+    # Numbers of 8 bits are not stored in files of more.
+    if not lit.size or lit.max() > low.full_scale or len(frames) == 1 or low.bit_depth <= 8:
         raise DataError(
-            f"{high.name}: expected values up to {low.full_scale} as in {low.name}, or those spread over "
-            f"{high.full_scale}, found {pixels.max()}; convert one of them"
+            f"{high.name}: expected some frames of values up to {low.full_scale} as in {low.name}, or of those spread "
+            f"over {high.full_scale}; convert one of the two to the depth of the other"
         )
     return dark.full_scale / clip.full_scale
 
