@@ -39,7 +39,7 @@ class Selection:
     max_pixels : int, optional
         Largest frame or image to read, pixels; by default 67 million.
     bayer : {"rggb", "grbg", "gbrg", "bggr"}, optional
-        Bayer pattern of raw frames, from the upper left.  Grey frames are then taken for those of a raw camera.
+        Bayer pattern of raw frames, from the upper left, in place of none or of the one that the file names.
     hdr : {"sdr", "keep"}
         Read HDR video as SDR, or keep its codes.  HLG and PQ are meant; ``steady`` writes kept codes as tagged HDR.
     dark : str, optional
