@@ -52,6 +52,13 @@ def test_the_geometric_mean_of_three_widths_is_removed():
     assert alone / wide == pytest.approx(1.5 ** (1 / 8))
 
 
+def test_an_image_that_tells_a_harmful_blur_does_not_count():
+    # The parabola falls below no gain beyond a factor of 1.65.
+    weights = networks_of(0.0, -1.0, peak_at(1.0))
+    assert blur_of(weights, alone=50.0).removed == pytest.approx(50 ** (1 / 8), rel=0.01)
+    assert blur_of(weights, alone=60.0).removed == pytest.approx(1.0, rel=0.01)
+
+
 def test_an_image_that_tells_no_blur_does_not_count():
     weights = networks_of(0.0, -1.0, peak_at(1.0))
     assert blur_of(weights, low=0.81, alone=0.0).removed == pytest.approx(0.9, rel=0.01)

@@ -16,9 +16,10 @@ scatter adds to the deviation.  Of the widths whose G is as good as the largest,
 the widest is chosen that is no wider than σ or than the best.
 
 What is removed is a geometric mean of that width, of σ_16 and, with a small share, of the width that the image alone
-tells, if it tells one; or nothing where G expects a loss from it.  The networks know more simulators than the theory of
-the posterior, and are wrong where a clip is like none of them; the posterior errs elsewhere.  The image alone is right
-about text and charts, and takes soft scenes for blurred ones.  ``benchmarks/decisions/blur.md`` compares them.
+tells.  Where G expects a loss from it, the image does not count; where a loss is expected still, nothing is removed.
+The networks know more simulators than the theory of the posterior, and are wrong where a clip is like none of them; the
+posterior errs elsewhere.  The image alone is right about text and charts, and takes soft scenes for blurred ones.
+``benchmarks/decisions/blur.md`` compares them.
 
 ``python benchmarks/blur_training.py`` makes the clips, trains and judges the networks, and writes ``learnt_blur.npz``.
 """
@@ -141,8 +142,9 @@ def learnt_blur(
     gains = out[:, 2:].mean(axis=0)
     gains = gains - gains[0]
     together = (usual * _widest(gains, float(quantiles[1]) / usual) * low) ** 0.5
-    removed = together ** (1 - _ALONE) * (alone or together) ** _ALONE
-    return LearntBlur(quantiles, removed if np.interp(removed / usual, FACTORS, gains) >= 0 else 0.0)
+    with_image = together ** (1 - _ALONE) * (alone or together) ** _ALONE
+    safe = (width for width in (with_image, together) if np.interp(width / usual, FACTORS, gains) >= 0)
+    return LearntBlur(quantiles, next(safe, 0.0))
 
 
 def _widest(gains: Float64Array, most: float) -> float:
