@@ -1,5 +1,7 @@
 """Arrays, stacks and folders as programs and phones write them: axes, channels, white, turns, thumbnails."""
 
+import tracemalloc
+
 import cv2
 import numpy as np
 import PIL.Image
@@ -33,6 +35,15 @@ class TestArrays:
         last = FrameSource.from_array(np.ascontiguousarray(np.moveaxis(STILL, 0, -1)))
         assert last.shape == (40, 56, 14) and "np.moveaxis" in last.warnings[0]
         assert FrameSource.from_array(STILL).warnings == FrameSource.from_array(COLOUR).warnings == ()
+
+    def test_large_arrays_are_not_copied_to_tell_their_axes(self):
+        frames = np.zeros((20, 480, 640), np.float32)
+        frames[:] = np.random.default_rng(2).random((480, 640), np.float32)
+        tracemalloc.start()
+        assert FrameSource.from_array(frames).warnings == ()
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 0.3 * frames.nbytes
 
     @pytest.mark.parametrize(
         ("order", "axes"), [((0, 3, 1, 2), "(T, 3, H, W)"), ((1, 2, 3, 0), "(H, W, 3, T)")], ids=["TCHW", "HWCT"]

@@ -38,8 +38,8 @@ def frames_are_last(array: NDArray[Any], certain: bool = False) -> bool:
     if array.dtype.kind not in "iuf":
         return False
     places = [np.unique(np.linspace(0, length - 1, SAMPLES).astype(int)) for length in array.shape]
-    # Whole planes of the last axis would read the whole file.
-    block = np.asarray(array[places[0]][:, places[1]][:, :, places[2]], np.float64)
+    # Selecting axis by axis would copy whole planes.
+    block = np.asarray(array[np.ix_(*places)], np.float64)
     if not np.isfinite(block).all():
         return False
     block = _without_blank_planes(block)
