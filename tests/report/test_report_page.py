@@ -16,6 +16,7 @@ from turbrestore.core.decision import Decision
 from turbrestore.core.verdict import CheckKind
 from turbrestore.pipeline import restore
 from turbrestore.report import facts, render_report
+from turbrestore.report.facts import duration
 from turbrestore.runs.run_record import RunRecord
 from turbrestore.runtime.scratch import new_stack
 
@@ -169,3 +170,8 @@ class TestPage:
         laps = facts.laps(whole)
         assert [lap.start for lap in laps[1:]] == pytest.approx([lap.start + lap.share for lap in laps[:-1]])
         assert sum(lap.share for lap in laps) == pytest.approx(100)
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(9.96, "10.0 s"), (179.9, "3 min 0 s"), (150.4, "2 min 30 s")])
+def test_durations_are_rounded_as_a_whole(seconds, text):
+    assert duration(seconds) == text

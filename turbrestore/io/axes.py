@@ -23,7 +23,7 @@ _BLANK = 0.1
 def frames_are_last(array: NDArray[Any], certain: bool = False) -> bool:
     """Whether the planes of the last of three axes resemble each other more than those of the first.
 
-    Unless one is to be ``certain``, that square planes are at the end counts as well.
+    With ``certain``, it is not taken for a hint that square planes come last.
     """
     shape = array.shape
     # Only square frames make the last two axes, and no others, equally long.
