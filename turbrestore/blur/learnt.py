@@ -15,10 +15,11 @@ widths; widths are relative to that of the posterior, which is about right at ev
 scatter adds to the deviation.  Of the widths whose G is as good as the largest, but for a difference that is not seen,
 the widest is chosen that is no wider than σ or than the best.
 
-What is removed is a geometric mean of that width, of σ_16 and, with a small share, of the width that the image alone
-tells.  Where G expects a loss from it, the image does not count; where a loss is expected still, nothing is removed.
-The networks know more simulators than the theory of the posterior, and are wrong where a clip is like none of them; the
-posterior errs elsewhere.  The image alone is right about text and charts, and takes soft scenes for blurred ones.
+What is removed is the median of three widths: this bold one, a cautious one, which is its geometric mean with σ_16, and
+the one that the image alone tells, which so decides between the two at most.  Where G expects a loss, the cautious one
+is removed, or nothing.  The networks know more simulators than the theory of the posterior, and are wrong where a clip
+is like none of them; the posterior errs elsewhere, most of all where it has two peaks.  The image alone is right about
+text, charts and streets, and takes soft scenes for blurred ones.
 ``benchmarks/decisions/blur.md`` compares them.
 
 ``python benchmarks/blur_training.py`` makes the clips, trains and judges the networks, and writes ``learnt_blur.npz``.
@@ -56,8 +57,6 @@ LOG_SPREADS = (-3.0, 1.0)
 FARTHEST = 4.0
 # Reductions at which gradients are read; the shortest side that they leave has as many pixels as the largest.
 _SCALES = (1, 2, 4, 8)
-# Share of the width by the image alone, by cross-validation.
-_ALONE = 1 / 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +140,10 @@ def learnt_blur(
     quantiles = usual * np.exp(out[:, 0].mean() + spread * np.array([-1.0, 0.0, 1.0]))
     gains = out[:, 2:].mean(axis=0)
     gains = gains - gains[0]
-    together = (usual * _widest(gains, float(quantiles[1]) / usual) * low) ** 0.5
-    with_image = together ** (1 - _ALONE) * (alone or together) ** _ALONE
-    safe = (width for width in (with_image, together) if np.interp(width / usual, FACTORS, gains) >= 0)
+    bold = usual * _widest(gains, float(quantiles[1]) / usual)
+    cautious = (bold * low) ** 0.5
+    middle = sorted((bold, cautious, alone or cautious))[1]
+    safe = (width for width in (middle, cautious) if np.interp(width / usual, FACTORS, gains) >= 0)
     return LearntBlur(quantiles, next(safe, 0.0))
 
 
