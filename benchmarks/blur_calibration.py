@@ -25,11 +25,11 @@ from blur_clips import Case, cases, make_clip
 from provenance import publish
 from scipy import fft
 
-from turbrestore.blind.remove_blur import find_blur, remove_blur_steps
 from turbrestore.blur.posterior import BlurWitnesses, measure_witnesses
 from turbrestore.blur.witnesses.hypotheses import shapes
 from turbrestore.blur.witnesses.spectral_variation import RINGS, SIDE
 from turbrestore.core.arrays import FloatArray
+from turbrestore.deblurring.remove_blur import find_blur, remove_blur_steps
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.registration.warp import warp
 from turbrestore.runtime.runtime import DEFAULT

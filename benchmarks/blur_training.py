@@ -29,13 +29,13 @@ from blur_simulators import SHARES, SimulatedClip, simulate
 from provenance import publish
 
 from turbrestore import DeconvolutionParams, TurbrestoreError, pipeline
-from turbrestore.blind import remove_blur
 from turbrestore.blur import posterior
 from turbrestore.blur.learnt import FACTORS, FARTHEST, LOG_SPREADS, LearntBlur, blur_features, learnt_blur
 from turbrestore.blur.psf import GAUSSIAN, radial_otf
 from turbrestore.blur.witnesses.spectral_variation import RINGS, SIDE
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.noise_spectrum import NoiseSpectrum
+from turbrestore.deblurring import remove_blur
 from turbrestore.deconvolution.deconvolve import deconvolve
 from turbrestore.runtime.runtime import Runtime
 

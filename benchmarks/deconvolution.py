@@ -23,8 +23,8 @@ import numpy as np
 from revisions import take_two_cores
 from scipy import fft
 
-from turbrestore.blind.remove_blur import remove_blur_steps
 from turbrestore.blur.psf import KOLMOGOROV, blur_otf
+from turbrestore.deblurring.remove_blur import remove_blur_steps
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve_steps
 from turbrestore.deconvolution.nonlocal_prior.nonlocal_weights import nonlocal_weights
 from turbrestore.deconvolution.problem import MARGIN_SIGMAS

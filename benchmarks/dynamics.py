@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 from provenance import publish
 
-from turbrestore.blind.remove_blur import remove_blur_steps
 from turbrestore.core.arrays import FloatArray
+from turbrestore.deblurring.remove_blur import remove_blur_steps
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.dynamics.dynamic_texture import identify
 from turbrestore.filtering.alternating import FilterParams, filter_frames

@@ -14,9 +14,9 @@ import sys
 import numpy as np
 from provenance import publish_printed
 
-from turbrestore.blind.guards import WIDEST_RINGS, GuardReading, evaluate_guards
 from turbrestore.blur.psf import GAUSSIAN, blur_otf
 from turbrestore.core.arrays import FloatArray, luminance
+from turbrestore.deblurring.guards import WIDEST_RINGS, GuardReading, evaluate_guards
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.synthesis.scenes import SCENES
 

@@ -22,9 +22,9 @@ from blur_clips import part_of
 from clips import DRAWN_SCENES
 from provenance import publish
 
-from turbrestore.blind.remove_blur import remove_blur_steps
 from turbrestore.blur.witnesses.hypotheses import shapes
 from turbrestore.core.arrays import FloatArray
+from turbrestore.deblurring.remove_blur import remove_blur_steps
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore

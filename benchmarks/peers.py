@@ -33,9 +33,9 @@ from quality import panel
 from revisions import child
 from words import can_read, share_read
 
-from turbrestore.blind.remove_blur import remove_blur_steps
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import TurbrestoreError
+from turbrestore.deblurring.remove_blur import remove_blur_steps
 from turbrestore.footage.frame_selection import best_frames, frame_quality
 from turbrestore.io.images.image_files import write_image
 from turbrestore.io.output import atomic_write

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from cyclopts import Parameter
 
-from turbrestore.blind.guards import GuardParams, evaluate_guards
-from turbrestore.blind.remove_blur import SIGMAS_A_SIDE, remove_blur_steps
 from turbrestore.blur.estimation import BlurEstimate
 from turbrestore.blur.measured_psf import psf_from_image
 from turbrestore.blur.posterior import BlurPosterior
@@ -19,6 +17,8 @@ from turbrestore.core.arrays import FloatArray, luminance
 from turbrestore.core.errors import ConfigurationError, InputNotFoundError, require, require_between
 from turbrestore.core.gradient import sobel_gradient
 from turbrestore.core.remarks import counted
+from turbrestore.deblurring.guards import GuardParams, evaluate_guards
+from turbrestore.deblurring.remove_blur import SIGMAS_A_SIDE, remove_blur_steps
 from turbrestore.deconvolution.deconvolve import Deconvolution, DeconvolutionParams
 from turbrestore.deconvolution.deconvolve import deconvolve as deconvolve_image
 from turbrestore.display.figure import new_figure

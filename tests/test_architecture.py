@@ -13,9 +13,8 @@ PACKAGE = Path(__file__).parents[1] / "turbrestore"
 # A folder, or a module that lies beside the folders, imports only from itself and from those before it.
 ORDER = [
     "core", "runtime", "display", "io", "registration", "footage", "dynamics", "filtering", "blur_moments", "blur",
-    "deconvolution", "blind", "steady", "synthesis", "seeing", "uncertainty", "agreement", "metrics", "wording",
-    "results", "settings", "memory_plan", "runs", "preparation", "stacking", "fusion", "evidence", "pipeline",
-    "report",
+    "deconvolution", "deblurring", "verification", "steady", "synthesis", "seeing", "metrics", "wording", "results",
+    "settings", "memory_plan", "runs", "preparation", "stacking", "fusion", "evidence", "pipeline", "report",
 ]  # fmt: skip
 LEAVES = {"blur_moments"}
 HEAVY = {"torch", "kornia", "numba", "matplotlib", "av", "imageio", "tifffile", "skimage", "rich", "PIL", "cyclopts"}

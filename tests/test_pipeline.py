@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
-from turbrestore.blind.remove_blur import blur_to_remove
 from turbrestore.blur.estimation import BlurEstimate
 from turbrestore.core.errors import ConfigurationError, DataError
+from turbrestore.deblurring.remove_blur import blur_to_remove
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.filtering.alternating import FilterParams
 from turbrestore.io.source import FrameSource

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
-from turbrestore.blind.structure import StructureReading
 from turbrestore.core.decision import Decision
 from turbrestore.core.verdict import CheckKind
 from turbrestore.pipeline import restore
 from turbrestore.settings import RestoreParams
+from turbrestore.verification.structure import StructureReading
 
 
 @pytest.fixture(scope="module")

@@ -9,15 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .agreement.last_guard import MOSTLY, Guarded, disputed_detail, keep_agreed
-from .blind.remove_blur import Deblurred, left_blurred
-from .blind.structure import compare_structure
 from .blur.posterior import BlurWitnesses, measure_witnesses
 from .blur.witnesses.short_exposure import displacement_variance
 from .core.arrays import ROUNDING, FloatArray, luminance
 from .core.decision import Decision
 from .core.noise import NoiseCurve, photon_noise
 from .core.noise_spectrum import NoiseSpectrum
+from .deblurring.remove_blur import Deblurred, left_blurred
 from .deconvolution.conjugate_gradient import wiener_filtered
 from .filtering.filter_records import Filtered
 from .fusion import Run
@@ -28,6 +26,8 @@ from .registration.warp import warp
 from .results import Restoration
 from .runtime.scratch import iter_frames
 from .seeing.strength import Seeing
+from .verification.halves import MOSTLY, Guarded, disputed_detail, keep_agreed
+from .verification.structure import compare_structure
 from .wording import explain_few_frames, explain_structure
 
 # Least variance of the noise of dark parts, relative to that of bright ones, that the decision states.

@@ -43,7 +43,7 @@ from .runtime.steps import Progress, finish, step_counter
 from .runtime.tiling import HaloTile, add_tile, cut_tile, halo_tiles, new_mosaic
 from .settings import RestoreParams
 from .stacking.placement import centroid_of_known_flows, onto_reference
-from .uncertainty.pixel_deviation import SATURATED, saturation_level
+from .verification.pixel_deviation import SATURATED, saturation_level
 from .wording import explain_input, explain_training
 
 # As ``map`` does, applies a function to every task and yields the results in order; it may do so in other processes,

@@ -26,10 +26,9 @@ from pathlib import Path
 
 import numpy as np
 
-from .agreement.last_guard import keep_agreed_memory
-from .blind.remove_blur import SMALLEST_SIDE, remove_blur_memory
 from .core.decision import Decision
 from .core.errors import ConfigurationError, DataError, require
+from .deblurring.remove_blur import SMALLEST_SIDE, remove_blur_memory
 from .dynamics.dynamic_texture import identify_memory, modes_memory
 from .filtering.filter_records import filter_memory
 from .footage.survey import survey_memory, survey_scratch_bytes
@@ -42,6 +41,7 @@ from .runtime.memory_size import size_text
 from .runtime.runtime import Runtime
 from .runtime.tiling import HALO, halo_tiles, largest_tile
 from .settings import RestoreParams
+from .verification.halves import keep_agreed_memory
 
 _FEWEST_TRAINED, _MOST_TRAINED = 40, 100
 # Fewer training frames than these are not worth a lower limit.

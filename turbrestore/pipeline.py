@@ -10,12 +10,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .blind.remove_blur import SIGMAS_A_SIDE, Deblurred, find_blur, remove_blur_steps
 from .blur.measured_psf import psf_from_image
 from .core.arrays import FloatArray
 from .core.decision import Decision
 from .core.errors import require, settings_of
 from .core.noise import NoiseCurve
+from .deblurring.remove_blur import SIGMAS_A_SIDE, Deblurred, find_blur, remove_blur_steps
 from .deconvolution.problem import read_blur
 from .dynamics.dynamic_texture import identify
 from .evidence import Evidence, agreed_image, evidence_of_frames, measure_photon_noise
@@ -42,7 +42,7 @@ from .seeing.strength import Seeing, seeing_of_picture
 from .settings import RestoreParams
 from .stacking.fine_grid import fine_image, fine_shape
 from .stacking.placement import settings_of_known_flows
-from .uncertainty.pixel_deviation import measure_deviation
+from .verification.pixel_deviation import measure_deviation
 from .wording import (
     explain_border,
     explain_camera,

@@ -9,10 +9,6 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
-from .agreement.last_guard import MOSTLY, disputed_detail
-from .agreement.repetition import repetition
-from .blind.guards import GuardReading
-from .blind.structure import StructureReading
 from .blur.estimation import BlurEstimate
 from .blur.posterior import BlurPosterior
 from .core.arrays import ROUNDING, FloatArray
@@ -20,6 +16,7 @@ from .core.decision import Decision
 from .core.noise_spectrum import NoiseSpectrum
 from .core.remarks import counted
 from .core.verdict import Check, CheckKind, Verdict
+from .deblurring.guards import GuardReading
 from .deconvolution.deconvolve import Deconvolution
 from .display.maps import plot_images
 from .display.preview import preview
@@ -31,6 +28,9 @@ from .registration.centroid import Centroid
 from .registration.coverage import Rectangle
 from .runtime.scratch import variance_of
 from .seeing.strength import Seeing
+from .verification.halves import MOSTLY, disputed_detail
+from .verification.repetition import repetition
+from .verification.structure import StructureReading
 from .wording import share_words, write_check
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal
 
-from .blind.guards import GuardParams
 from .blur.psf import GAUSSIAN
 from .core.errors import require, require_between
+from .deblurring.guards import GuardParams
 from .deconvolution.deconvolve import DeconvolutionParams
 from .dynamics.dynamic_texture import DynamicsParams
 from .filtering.alternating import FilterParams

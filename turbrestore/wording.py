@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from .blind.structure import LASTING, LEFT, UNSEEN, StructureReading
 from .core.arrays import FloatArray
 from .core.decision import Decision
 from .core.remarks import counted
@@ -19,6 +18,7 @@ from .registration.coverage import Rectangle
 from .registration.recentring import recentring_flow
 from .runtime.scratch import iter_frames
 from .seeing.strength import LARGEST_BLUR, Estimate, Seeing
+from .verification.structure import LASTING, LEFT, UNSEEN, StructureReading
 
 # A frame counts if its weight is at least this share of the average weight.
 _COUNTS = 0.2

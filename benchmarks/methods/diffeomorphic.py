@@ -27,9 +27,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from turbrestore.blind.remove_blur import remove_blur_steps
 from turbrestore.blur.psf import GAUSSIAN
 from turbrestore.core.arrays import FloatArray
+from turbrestore.deblurring.remove_blur import remove_blur_steps
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.registration.flow import estimate_flow
 from turbrestore.registration.flow_algebra import compose_flows, invert_flow

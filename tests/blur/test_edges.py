@@ -4,11 +4,11 @@ import cv2
 import numpy as np
 import pytest
 
-from turbrestore.blind.decisions import explain_blur
-from turbrestore.blind.remove_blur import remove_blur_steps
 from turbrestore.blur.edges import _widest_blur
 from turbrestore.blur.estimation import estimate_blur
 from turbrestore.blur.psf import GAUSSIAN, blur_otf, fused_exponent
+from turbrestore.deblurring.decisions import explain_blur
+from turbrestore.deblurring.remove_blur import remove_blur_steps
 from turbrestore.runtime.steps import finish
 from turbrestore.synthesis.scenes import SCENES
 

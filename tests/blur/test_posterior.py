@@ -6,8 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from turbrestore.blind.decisions import explain_posterior
-from turbrestore.blind.remove_blur import find_blur, remove_blur_steps
 from turbrestore.blur.estimation import find_candidates
 from turbrestore.blur.learnt import LearntBlur
 from turbrestore.blur.posterior import EXCLUDED, BlurWitnesses, blur_posterior, estimate_posterior, measure_witnesses
@@ -17,6 +15,8 @@ from turbrestore.blur.witnesses.image_evidence import image_evidence, judged_can
 from turbrestore.blur.witnesses.short_exposure import displacement_variance, short_exposures
 from turbrestore.blur.witnesses.spectral_variation import RINGS, SpectralVariation
 from turbrestore.core.noise_spectrum import white_noise
+from turbrestore.deblurring.decisions import explain_posterior
+from turbrestore.deblurring.remove_blur import find_blur, remove_blur_steps
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.runtime.runtime import DEFAULT
 from turbrestore.runtime.steps import finish

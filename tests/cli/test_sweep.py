@@ -5,7 +5,7 @@ import pytest
 from command_line import QUICK, fails
 
 from conftest import SCENES, blurred
-from turbrestore.blind.guards import GuardParams
+from turbrestore.deblurring.guards import GuardParams
 from turbrestore.deconvolution.deconvolve import Deconvolution, DeconvolutionParams
 from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.runs.stage_files import load_artifact

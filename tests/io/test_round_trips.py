@@ -11,8 +11,8 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from turbrestore.blind.guards import GuardReading
 from turbrestore.core.decision import Decision
+from turbrestore.deblurring.guards import GuardReading
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
 from turbrestore.filtering.alternating import Filtered, FilterParams

@@ -10,10 +10,10 @@ import shlex
 import numpy as np
 import pytest
 
-from turbrestore.blind.guards import GuardReading
 from turbrestore.core.arrays import from_unit
 from turbrestore.core.decision import Decision
 from turbrestore.core.verdict import CheckKind
+from turbrestore.deblurring.guards import GuardReading
 from turbrestore.pipeline import restore
 from turbrestore.report import facts, render_report
 from turbrestore.report.facts import duration

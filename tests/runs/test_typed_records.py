@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from turbrestore.blind.guards import GuardReading
 from turbrestore.core.errors import DataError
+from turbrestore.deblurring.guards import GuardReading
 from turbrestore.registration.centroid import CentroidParams
 from turbrestore.results import Restoration
 from turbrestore.runs.typed_records import KeptRecord, convert_to

@@ -20,12 +20,12 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
-from ..blind.remove_blur import Deblurred
 from ..blur.estimation import BlurEstimate
 from ..blur.posterior import BlurPosterior
 from ..core.arrays import check_image
 from ..core.errors import DataError, OutputError, require
 from ..core.remarks import counted
+from ..deblurring.remove_blur import Deblurred
 from ..deconvolution.deconvolve import Deconvolution
 from ..filtering.filter_records import FilterCheckpoint
 from ..footage.levels import Levels

@@ -6,9 +6,9 @@ import re
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from ..blind.guards import GuardReading
 from ..core.decision import Decision
 from ..core.errors import ConfigurationError, DataError
+from ..deblurring.guards import GuardReading
 
 Kind = TypeVar("Kind")
 

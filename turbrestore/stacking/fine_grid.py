@@ -30,11 +30,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..agreement.last_guard import keep_agreed
-from ..blind.remove_blur import guarded_steps
 from ..blur.psf import GAUSSIAN, blur_otf
 from ..core.arrays import ROUNDING, FloatArray, luminance
 from ..core.decision import Decision
+from ..deblurring.remove_blur import guarded_steps
 from ..deconvolution.deconvolve import Deconvolution, deconvolve_steps
 from ..deconvolution.stopping import Steps
 from ..preparation import Prepared
@@ -44,6 +43,7 @@ from ..runtime.runtime import Runtime
 from ..runtime.steps import finish
 from ..runtime.threads import sum_in_threads
 from ..settings import RestoreParams
+from ..verification.halves import keep_agreed
 from .registered import registering_flows
 
 # Weight of the interpolated frame, where a sample in its place has 1.

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from conftest import natural_scene
-from turbrestore.agreement.repetition import repetition
 from turbrestore.synthesis.scenes import resolution_chart
+from turbrestore.verification.repetition import repetition
 
 
 @pytest.mark.parametrize("period", [6, 9, 15])

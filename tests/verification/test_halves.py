@@ -3,14 +3,13 @@
 import cv2
 import numpy as np
 
-from turbrestore.agreement import last_guard
-from turbrestore.agreement.last_guard import keep_agreed
 from turbrestore.core.arrays import luminance
 from turbrestore.core.noise import NoiseCurve
 from turbrestore.core.noise_spectrum import RINGS, NoiseSpectrum
 from turbrestore.metrics import psnr
 from turbrestore.registration.registered_noise import Halves
 from turbrestore.synthesis.scenes import SCENES
+from turbrestore.verification.halves import keep_agreed
 
 NOISE = 0.02
 
@@ -127,7 +126,7 @@ def test_rows_are_worked_on_in_parts_as_if_in_one(monkeypatch):
     scene = np.float32(rng.random((560, 24)))
     halves, result = halves_of(scene, noise=0.2), np.float32(scene + rng.normal(0, 0.3, scene.shape))
     parts = guarded_by(result, halves)
-    monkeypatch.setattr(last_guard, "_ROWS", 1000)
+    monkeypatch.setattr("turbrestore.verification.halves._ROWS", 1000)
     whole = guarded_by(result, halves)
     np.testing.assert_allclose(parts.image, whole.image, atol=1e-6)
     np.testing.assert_allclose(parts.share, whole.share, atol=1e-4)

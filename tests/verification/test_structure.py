@@ -7,10 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from conftest import make_sequence
-from turbrestore.blind.structure import LASTING, LEFT, UNSEEN, StructureReading, compare_structure
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
 from turbrestore.synthesis.scenes import SCENES
+from turbrestore.verification.structure import LASTING, LEFT, UNSEEN, StructureReading, compare_structure
 from turbrestore.wording import explain_structure
 
 SIDE = 112

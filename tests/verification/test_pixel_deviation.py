@@ -14,7 +14,7 @@ from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
 from turbrestore.synthesis.scenes import picture
 from turbrestore.synthesis.smooth_flow import distort, smooth_flows
-from turbrestore.uncertainty.pixel_deviation import (
+from turbrestore.verification.pixel_deviation import (
     pixel_deviation,
     posterior_gain,
     quadratic_fidelity,

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from turbrestore.blind.guards import GuardParams, GuardReading, evaluate_guards, ringing
 from turbrestore.blur.psf import blur_otf
 from turbrestore.core.arrays import luminance
 from turbrestore.core.errors import ConfigurationError, DataError
+from turbrestore.deblurring.guards import GuardParams, GuardReading, evaluate_guards, ringing
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.runtime.scratch import to_scratch
 from turbrestore.synthesis.scenes import SCENES

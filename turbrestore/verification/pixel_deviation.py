@@ -38,10 +38,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..blind.remove_blur import Deblurred
 from ..blur.psf import GAUSSIAN, blur_otf, laplacian_symbol
 from ..core.arrays import FloatArray, luminance
 from ..core.gradient import sobel_gradient
+from ..deblurring.remove_blur import Deblurred
 from ..deconvolution.conjugate_gradient import wiener_fidelity
 from ..deconvolution.deconvolve import DeconvolutionParams, automatic_fidelity
 from ..deconvolution.problem import MARGIN_SIGMAS, margin_around

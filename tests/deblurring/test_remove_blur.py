@@ -6,9 +6,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from turbrestore.blind.guards import GuardParams
-from turbrestore.blind.remove_blur import guarded_steps, remove_blur_memory, remove_blur_steps
 from turbrestore.blur.psf import KOLMOGOROV, blur_otf
+from turbrestore.deblurring.guards import GuardParams
+from turbrestore.deblurring.remove_blur import guarded_steps, remove_blur_memory, remove_blur_steps
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve_steps
 from turbrestore.metrics import psnr
 from turbrestore.runtime.steps import finish

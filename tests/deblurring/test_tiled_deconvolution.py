@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from turbrestore.blind.remove_blur import tiled_deconvolution_steps
 from turbrestore.blur.psf import GAUSSIAN, blur_otf
+from turbrestore.deblurring.remove_blur import tiled_deconvolution_steps
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.metrics import psnr
 from turbrestore.runtime.runtime import Runtime

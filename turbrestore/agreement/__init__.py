@@ -1,1 +1,0 @@
-"""How far a restored image is to be believed, pixel by pixel."""

@@ -1,1 +1,0 @@
-"""Standard deviation of every pixel of a restored image."""
