@@ -28,10 +28,10 @@ import cv2
 import numpy as np
 
 from turbrestore.core.arrays import FloatArray
-from turbrestore.fusion import TileMap
 from turbrestore.io.video import open_frames
 from turbrestore.metrics import psnr
 from turbrestore.pipeline import restore
+from turbrestore.restoration_run import TileMap
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.settings import RestoreParams
 from turbrestore.synthesis.scenes import SCENES

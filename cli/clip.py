@@ -10,7 +10,6 @@ from pathlib import Path
 
 from turbrestore.core.decision import Decision
 from turbrestore.core.errors import require
-from turbrestore.fusion import TileMap
 from turbrestore.io.images.image_files import write_map
 from turbrestore.io.output import check_output
 from turbrestore.io.pixels import check_depth
@@ -18,6 +17,7 @@ from turbrestore.io.source import FrameSource
 from turbrestore.memory_plan import training_share
 from turbrestore.metrics import comparable
 from turbrestore.pipeline import restore as run_pipeline
+from turbrestore.restoration_run import TileMap
 from turbrestore.results import Restoration
 from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.settings import Preset, RestoreParams

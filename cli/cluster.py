@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from turbrestore.core.errors import ConfigurationError, TurbrestoreError, require
 from turbrestore.core.extras import missing_package
-from turbrestore.fusion import TileMap
 from turbrestore.io.limits import first_line
+from turbrestore.restoration_run import TileMap
 
 from .progress import say
 

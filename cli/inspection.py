@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from turbrestore.core.arrays import FloatArray, check_flow
 from turbrestore.core.errors import DataError, require
 from turbrestore.footage.checks.content import ContentReport, clean_source
-from turbrestore.fusion import temporal_mean
+from turbrestore.footage.temporal_mean import temporal_mean
 from turbrestore.io.images.image_files import read_image
 from turbrestore.io.limits import DEFAULT_LIMITS, check_input, input_errors
 from turbrestore.io.npy import map_npy

@@ -124,7 +124,7 @@ def test_a_disk_without_room_is_refused_before_the_work(frames, limited, tmp_pat
         raise StorageError(f"{path}: needs {size}")
 
     monkeypatch.setattr(pipeline, "check_space", full)
-    monkeypatch.setattr("turbrestore.fusion.centroid_steps", None)
+    monkeypatch.setattr("turbrestore.pipeline.centroid_steps", None)
     with pytest.raises(StorageError, match=f"^{re.escape(str(tmp_path))}: needs"):
         pipeline.restore(frames, QUICK, replace(limited, scratch=tmp_path))
 

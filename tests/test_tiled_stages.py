@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from conftest import make_sequence
-from turbrestore import fusion, pipeline
+from turbrestore import pipeline, restoration_run
+from turbrestore import tiles as tiles_module
 from turbrestore.core.errors import ConfigurationError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.dynamics.dynamic_texture import DynamicsParams
 from turbrestore.filtering.alternating import Filtered
-from turbrestore.fusion import join_centroids, join_filtered
 from turbrestore.io.source import FrameSource
 from turbrestore.memory_plan import plan_memory
 from turbrestore.metrics import psnr
@@ -23,6 +23,7 @@ from turbrestore.runs.run_folder import RunFolder
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.tiling import cut_tile, halo_tiles
 from turbrestore.settings import RestoreParams
+from turbrestore.tiles import join_centroids, join_filtered
 
 HALO = 24
 TILES = halo_tiles((128, 128), 112, HALO)
@@ -102,7 +103,7 @@ def divide(patch, scratch):
 
     for module in (pipeline, run_folder_module):
         patch.setattr(module, "plan_memory", plan)
-    patch.setattr(fusion, "halo_tiles", lambda shape, side, halo=HALO: halo_tiles(shape, side, halo))
+    patch.setattr(restoration_run, "halo_tiles", lambda shape, side, halo=HALO: halo_tiles(shape, side, halo))
 
 
 @pytest.fixture
@@ -234,7 +235,7 @@ def test_frames_that_do_not_count_do_not_in_any_tile(sequence):
 def test_a_run_in_tiles_that_is_interrupted_ends_the_same(sequence, tiled, tmp_path, monkeypatch, finished):
     source = FrameSource.from_array(sequence.frames)
     (folder := tmp_path / "kept").mkdir()
-    kept, real = RunFolder(folder, source, QUICK), fusion._filter_tile
+    kept, real = RunFolder(folder, source, QUICK), tiles_module._filter_tile
 
     def interrupted(run, centroid, training, counted, number):
         if number == finished:
@@ -242,7 +243,7 @@ def test_a_run_in_tiles_that_is_interrupted_ends_the_same(sequence, tiled, tmp_p
         return real(run, centroid, training, counted, number)
 
     with monkeypatch.context() as patch:
-        patch.setattr(fusion, "_filter_tile", interrupted)
+        patch.setattr(tiles_module, "_filter_tile", interrupted)
         with pytest.raises(KeyboardInterrupt):
             pipeline.restore(source, QUICK, store=kept)
     later = RunFolder(folder, source, QUICK, resume=True)
@@ -260,7 +261,7 @@ def test_a_run_in_tiles_that_is_interrupted_ends_the_same(sequence, tiled, tmp_p
 
 @pytest.mark.usefixtures("in_tiles")
 def test_a_damaged_tile_is_filtered_again(sequence, tmp_path, monkeypatch):
-    source, real = FrameSource.from_array(sequence.frames), fusion._filter_tile
+    source, real = FrameSource.from_array(sequence.frames), tiles_module._filter_tile
     (folder := tmp_path / "kept").mkdir()
 
     def interrupted(run, centroid, training, counted, number):
@@ -269,7 +270,7 @@ def test_a_damaged_tile_is_filtered_again(sequence, tmp_path, monkeypatch):
         return real(run, centroid, training, counted, number)
 
     with monkeypatch.context() as patch:
-        patch.setattr(fusion, "_filter_tile", interrupted)
+        patch.setattr(tiles_module, "_filter_tile", interrupted)
         with pytest.raises(KeyboardInterrupt):
             pipeline.restore(source, QUICK, store=RunFolder(folder, source, QUICK))
     damaged = folder / "filtered_tile_0.npz"

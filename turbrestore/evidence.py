@@ -1,4 +1,4 @@
-"""What the training frames say about the filtered image: whether they have its structure, its noise, and its blur.
+"""What the training frames say: how strong the turbulence was; the structure, the noise and the blur of their image.
 
 It is gathered while the training frames are in memory, and used when they are gone.
 """
@@ -18,17 +18,19 @@ from .core.noise_spectrum import NoiseSpectrum
 from .deblurring.remove_blur import Deblurred, left_blurred
 from .deconvolution.conjugate_gradient import wiener_filtered
 from .filtering.filter_records import Filtered
-from .fusion import Run
+from .registration.centroid import Centroid
 from .registration.flow_algebra import invert_flow
 from .registration.recentring import recentring_flow
 from .registration.registered_noise import HalvedClip, Halves, halve
 from .registration.warp import warp
+from .restoration_run import Run
 from .results import Restoration
 from .runtime.scratch import iter_frames
-from .seeing.strength import Seeing
+from .seeing.displacement import LEAST_FRAMES
+from .seeing.strength import Seeing, seeing_of_picture
 from .verification.halves import MOSTLY, Guarded, disputed_detail, keep_agreed
 from .verification.structure import compare_structure
-from .wording import explain_few_frames, explain_structure
+from .wording import explain_few_frames, explain_seeing, explain_structure
 
 # Least variance of the noise of dark parts, relative to that of bright ones, that the decision states.
 _LEAST_SHARE = 0.01
@@ -50,6 +52,17 @@ class Evidence:
     noise: NoiseSpectrum | None = None  # of the filtered image
     witnesses: BlurWitnesses | None = None  # None if no blur is to be estimated
     halves: HalvedClip | None = None  # None then
+
+
+def seeing_of_frames(run: Run, training: FloatArray, centroid: Centroid) -> Seeing | None:
+    """Measure the strength of the turbulence, unless there are too few frames."""
+    if len(training) < LEAST_FRAMES:
+        return None
+    with run.timed("seeing"):
+        picture, threads = run.prepared.picture, run.plan.runtime.threads
+        seeing = seeing_of_picture(picture, training, centroid, run.params.optics, threads)
+    run.decide(*explain_seeing(seeing))
+    return seeing
 
 
 def evidence_of_frames(

@@ -7,7 +7,7 @@ and what one stage takes.  The plan is the first of these that fits:
 2. training frames and their flows in a scratch file, without a limit too where memory would take more than 2.2 GB;
 3. fewer threads;
 4. fewer training frames, down to ten, unless their number was given;
-5. frames in tiles that overlap (:mod:`turbrestore.fusion`), as large as fit.
+5. frames in tiles that overlap (:mod:`turbrestore.tiles`), as large as fit.
 
 The deconvolution splits its image into tiles where the limit is too small for the whole.  Fewer training frames and
 tiles change the result, slightly; nothing else does, and neither depends on the number of threads.

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,35 +15,37 @@ from .blur.measured_psf import psf_from_image
 from .core.arrays import FloatArray
 from .core.decision import Decision
 from .core.errors import require, settings_of
-from .core.noise import NoiseCurve
+from .core.noise import NoiseCurve, estimate_noise
 from .deblurring.remove_blur import SIGMAS_A_SIDE, Deblurred, find_blur, remove_blur_steps
 from .deconvolution.problem import read_blur
 from .dynamics.dynamic_texture import identify
-from .evidence import Evidence, agreed_image, evidence_of_frames, measure_photon_noise
+from .dynamics.flow_model import FlowDynamics
+from .evidence import Evidence, agreed_image, evidence_of_frames, measure_photon_noise, seeing_of_frames
+from .filtering.alternating import Filtered, filter_steps
 from .footage.checks.content import without_blank
-from .footage.levels import Levels
-from .fusion import Run, TileMap, added_up, centroid_stage, filter_stage, finish_mean, read_training
+from .footage.frame_selection import best_frames, frame_quality, only_counted
+from .footage.temporal_mean import added_up, finish_mean
 from .io.images.image_files import read_image
 from .io.output import check_space
 from .io.source import FrameSource
 from .memory_plan import plan_memory
 from .preparation import prepare
-from .registration.centroid import Centroid
+from .registration.centroid import Centroid, centroid_steps
 from .registration.coverage import SEEN, Rectangle, coverage, well_seen
 from .registration.flow import MIN_SIDE
 from .registration.recentring import recentre
+from .restoration_run import Run, TileMap
 from .results import Restoration, Store
 from .runtime.allocator import returning_freed_memory
 from .runtime.device import explain_device
 from .runtime.runtime import DEFAULT, Runtime
-from .runtime.scratch import mean_of
+from .runtime.scratch import drop_pages, iter_frames, mean_of, new_stack
 from .runtime.steps import Progress, finish
-from .seeing.displacement import LEAST_FRAMES
-from .seeing.strength import Seeing, seeing_of_picture
 from .settings import RestoreParams
 from .stacking.fine_grid import fine_image, fine_shape
-from .stacking.placement import settings_of_known_flows
-from .verification.pixel_deviation import measure_deviation
+from .stacking.placement import centroid_of_known_flows, onto_reference, settings_of_known_flows
+from .tiles import centroids_of_tiles, filtered_tiles, join_centroids, join_filtered
+from .verification.pixel_deviation import SATURATED, measure_deviation, saturation_level
 from .wording import (
     explain_border,
     explain_camera,
@@ -50,10 +53,13 @@ from .wording import (
     explain_dynamics,
     explain_frames,
     explain_geometry,
+    explain_input,
     explain_motion,
-    explain_seeing,
+    explain_training,
 )
 
+# Files of floating point are taken for those of 16 bits.
+_MOST_BITS = 16
 # A pixel that fewer frames show is about as noisy as in one of them.
 _FEW_FRAMES = 4
 
@@ -91,7 +97,7 @@ def restore(
         Called with every :class:`turbrestore.Decision` when it is made.
     map_tiles : callable, optional
         Works on tiles elsewhere, where ``runtime.tile`` or a memory limit asks for tiles; see
-        :data:`turbrestore.fusion.TileMap`.  By default they are worked on here, with the same result.
+        :data:`turbrestore.restoration_run.TileMap`.  By default they are worked on here, with the same result.
 
     Returns
     -------
@@ -136,8 +142,7 @@ def restore(
     prepared = prepare(source, params.static_mask, plan.runtime.scratch, progress)
     if store is not None:
         store.set_levels(prepared.levels)
-    stretched = _stretched_params(params, prepared.levels)
-    run = Run(prepared, stretched, plan, store, progress, on_decision, map_tiles)
+    run = Run(prepared, prepared.stretched(params), plan, store, progress, on_decision, map_tiles)
     run.seconds["read"] = time.perf_counter() - begun
     run.decide(
         *blank_decisions, *plan.decisions, *explain_device(runtime.device, plan.runtime.device, params.flow.method)
@@ -160,7 +165,7 @@ def _fuse(run: Run) -> tuple[Restoration, Evidence]:
 
     centroid = run.stage("centroid", "centroid", partial(centroid_stage, run, training))
     run.decide(explain_centroid(centroid), *explain_camera(centroid.flows), *explain_motion(centroid.flows))
-    seeing = _measure_seeing(run, training, centroid)
+    seeing = seeing_of_frames(run, training, centroid)
 
     dynamics, filtered = None, None
     if params.runs("identify"):
@@ -195,6 +200,69 @@ def _fuse(run: Run) -> tuple[Restoration, Evidence]:
     if filtered is None:
         return fused, Evidence(saturation)
     return evidence_of_frames(run, fused, filtered, training, saturation)
+
+
+def read_training(run: Run, stream: Iterator[FloatArray]) -> tuple[FloatArray, float]:
+    """Read the training frames; also the intensity from which their mean is saturated."""
+    levels, count, bits = run.prepared.levels, run.plan.train, min(run.source.bit_depth, _MOST_BITS)
+    least, share, brightest = levels.full_scale[1] - levels.gain * (1 - SATURATED), 0.0, 0.0
+    with run.timed("read"):
+        training = new_stack((count, *run.source.shape[1:]), run.plan.runtime.scratch)
+        for place in training:
+            # In a loop over the stream, one frame would stay in memory while the next is made.
+            place[...] = next(stream)
+            share += float(np.mean(place >= least)) / count
+            brightest = max(brightest, float(place.max()))
+            drop_pages(training)
+    run.decide(explain_training(count, len(run.source), run.params.train), *explain_input(share))
+    return training, saturation_level(brightest, estimate_noise(training[0]), levels.gain / (2**bits - 1), least)
+
+
+def centroid_stage(run: Run, training: FloatArray) -> Centroid:
+    """Find the centroid of the training frames, in the geometry that was asked for.
+
+    ``training`` (K, H, W) or (K, H, W, 3).
+    """
+    params, runtime = run.params, run.plan.runtime
+    if params.like is not None:
+        return centroid_of_known_flows(training, run.source, params.like, runtime)
+    if run.tiles:
+        parts = centroids_of_tiles(run, training)
+        found = join_centroids(parts, run.tiles, training.shape, runtime.scratch)
+    else:
+        steps = centroid_steps(training, params.centroid, params.flow, runtime)
+        found = finish(steps, run.counter("centroid", len(training) * params.centroid.iterations))
+    if params.reference is None:
+        return found
+    placed, reference_decision = onto_reference(found, training, params.reference, runtime)
+    run.decide(reference_decision)
+    return placed
+
+
+def filter_stage(
+    run: Run, centroid: Centroid, dynamics: FlowDynamics, training: FloatArray, rest: Iterator[FloatArray]
+) -> Filtered:
+    """Filter the training frames and those after them, and move the image onto the mean geometry of all frames.
+
+    With ``reference`` or ``like`` it stays in the geometry of the other clip.
+    ``training`` (K, H, W) or (K, H, W, 3).
+    """
+    params, source = run.params, run.source
+    counted = np.ones(len(source), bool)
+    if params.keep_best < 1:
+        counted = best_frames(frame_quality(source), params.keep_best)
+    if run.tiles:
+        parts = filtered_tiles(run, centroid, training, counted)
+        filtered = join_filtered(parts, run.tiles, source.shape[1:], run.plan.runtime.scratch)
+    else:
+        frames = only_counted(chain(iter_frames(training), rest), counted)
+        start = None if run.store is None else run.store.filter_start()
+        settings = params.filter, params.flow, centroid.flows, run.plan.runtime
+        steps = filter_steps(frames, centroid.image, dynamics, *settings, start)
+        filtered = finish(steps, partial(run.observe_filter, 0))
+    if params.reference is None and params.like is None:
+        return filtered.recentred()
+    return replace(filtered, mean_flow=np.zeros_like(filtered.mean_flow))
 
 
 def _deblur_and_crop(run: Run, fused: Restoration, evidence: Evidence, psf: NDArray[np.float64] | None) -> Restoration:
@@ -246,17 +314,6 @@ def _add_finer_grid(run: Run, restoration: Restoration) -> Restoration:
         upper, left = fine_shape((y, x), run.params.scale)
         lower, right = fine_shape((y + height, x + width), run.params.scale)
     return replace(restoration, finer=finer[upper:lower, left:right], decisions=tuple(run.decisions))
-
-
-def _measure_seeing(run: Run, training: FloatArray, centroid: Centroid) -> Seeing | None:
-    """Measure the strength of the turbulence, unless there are too few frames."""
-    if len(training) < LEAST_FRAMES:
-        return None
-    with run.timed("seeing"):
-        picture, threads = run.prepared.picture, run.plan.runtime.threads
-        seeing = seeing_of_picture(picture, training, centroid, run.params.optics, threads)
-    run.decide(*explain_seeing(seeing))
-    return seeing
 
 
 def _remove_blur(
@@ -328,10 +385,3 @@ def _check_training(params: RestoreParams, train: int, count: int) -> None:
         params.filter.training == "filter" or not params.runs("filter") or train < count,
         f"train: expected fewer than the {count} frames there are, as those that train are not filtered, found {train}",
     )
-
-
-def _stretched_params(params: RestoreParams, levels: Levels) -> RestoreParams:
-    """Bring the settings that are intensities to the levels of the stages."""
-    given, square = params.filter, levels.gain**2
-    noise = None if given.image_noise is None else given.image_noise * square
-    return replace(params, filter=replace(given, image_noise=noise, image_drift=given.image_drift * square))

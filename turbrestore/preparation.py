@@ -30,6 +30,7 @@ from .footage.survey import Survey, take_survey
 from .io.source import FrameSource, Window
 from .results import Restoration, at_levels_of_clip
 from .runtime.steps import Progress
+from .settings import RestoreParams
 
 Find = Callable[[Survey], Correction | None]
 
@@ -53,6 +54,12 @@ class Prepared:
     def picture(self) -> Window:
         """Rows and columns between the bars."""
         return next((each.picture for each in self.corrections if each.picture is not None), np.s_[:, :])
+
+    def stretched(self, params: RestoreParams) -> RestoreParams:
+        """Bring the settings that are intensities to the levels of the stages."""
+        given, square = params.filter, self.levels.gain**2
+        noise = None if given.image_noise is None else given.image_noise * square
+        return replace(params, filter=replace(given, image_noise=noise, image_drift=given.image_drift * square))
 
     def put_back(self, image: FloatArray) -> FloatArray:
         """Put what is no scene back into an image (H, W[, 3]) at the levels of the clip."""

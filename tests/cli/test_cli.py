@@ -299,7 +299,7 @@ def test_interruption_ends_with_130(run, clip, tmp_path, monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("turbrestore.fusion.centroid_steps", interrupt)
+    monkeypatch.setattr("turbrestore.pipeline.centroid_steps", interrupt)
     fails(run("restore", clip, tmp_path / "o.png"), 130, "interrupted")
     assert list(tmp_path.iterdir()) == []
 
@@ -308,7 +308,7 @@ def test_a_lack_of_memory_is_one_line(run, clip, tmp_path, monkeypatch):
     def fill(*_):
         raise MemoryError("Unable to allocate 9 GiB")
 
-    monkeypatch.setattr("turbrestore.fusion.centroid_steps", fill)
+    monkeypatch.setattr("turbrestore.pipeline.centroid_steps", fill)
     fails(run("restore", clip, tmp_path / "o.png"), 1, "out of memory", "--roi")
     assert list(tmp_path.iterdir()) == []
 

@@ -123,7 +123,7 @@ def fails(capsys, words, code, part):
 def test_a_disk_that_is_too_full_is_told_before_the_work(place, monkeypatch, capsys, more, free):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr("turbrestore.io.output.shutil.disk_usage", lambda _: usage(1 << 30, 0, free))
-    monkeypatch.setattr("turbrestore.fusion.centroid_steps", None)
+    monkeypatch.setattr("turbrestore.pipeline.centroid_steps", None)
     fails(capsys, ["restore", "clip.npy", "o.png", *more, *QUICK], StorageError.exit_code, "make room on the disk")
     assert [path.name for path in place.iterdir()] == ["clip.npy"]
 

@@ -70,14 +70,13 @@ def spy(monkeypatch):
     """Names of the stages that are computed from now on."""
     called = []
     for name in STAGES:
-        module = f"turbrestore.{'fusion' if name in ('centroid_steps', 'filter_steps') else 'pipeline'}"
-        real = getattr(sys.modules[module], name)
+        real = getattr(sys.modules["turbrestore.pipeline"], name)
 
         def counted(*arguments, real=real, name=name, **named):
             called.append(name)
             return real(*arguments, **named)
 
-        monkeypatch.setattr(f"{module}.{name}", counted)
+        monkeypatch.setattr(f"turbrestore.pipeline.{name}", counted)
     return called
 
 

@@ -80,7 +80,7 @@ def test_a_run_that_fails_before_it_has_anything_leaves_nothing(place, monkeypat
     def fail(*_):
         raise DataError("no such luck")
 
-    monkeypatch.setattr("turbrestore.fusion.centroid_steps", fail)
+    monkeypatch.setattr("turbrestore.pipeline.centroid_steps", fail)
     assert main(WORDS) == DataError.exit_code
     assert [path.name for path in place.iterdir()] == ["clip.npy"]
 

@@ -17,7 +17,7 @@ from turbrestore_cli.__main__ import main
 from .conftest import WORDS, contents, interrupt, params_of, spy
 
 PLACES = {
-    "centroid": ("turbrestore.fusion.centroid_steps", 1),
+    "centroid": ("turbrestore.pipeline.centroid_steps", 1),
     "flow model": ("turbrestore.pipeline.identify", 1),
     "first block": ("turbrestore.filtering.alternating.pass_over", 1),
     "third block": ("turbrestore.filtering.alternating.pass_over", 4),

@@ -6,13 +6,13 @@ that stack images of planets. Division makes it independent of brightness, and t
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ..core.arrays import check_grey
+from ..core.arrays import FloatArray, check_grey
 from ..core.errors import ConfigurationError, DataError, require
 
 # Small enough for the detail that turbulence blurs, large enough to suppress pixel noise.
@@ -53,6 +53,11 @@ def best_frames(quality: ArrayLike, share: float) -> np.ndarray:
     kept = np.zeros(values.shape, bool)
     kept[np.argsort(-values, kind="stable")[: int(np.ceil(round(share * values.size, 9)))]] = True
     return kept
+
+
+def only_counted(frames: Iterable[FloatArray], counted: NDArray[np.bool_]) -> Iterator[FloatArray | None]:
+    """Replace frames that do not count by None."""
+    return (frame if counts else None for frame, counts in zip(frames, counted, strict=True))
 
 
 def check_share(share: float) -> None:
