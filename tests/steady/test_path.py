@@ -16,10 +16,10 @@ def wander(count, correlation, rng):
     return shifts
 
 
-def steadied(shifts, velocity=0.0):
+def steadied(shifts, velocity=0.0, numbers=None):
     """Where frames end up from where they are, each with the frames before it and some after it."""
     ends = []
-    for number in range(LONGEST, len(shifts) - 12):
+    for number in range(LONGEST, len(shifts) - 12) if numbers is None else numbers:
         known = [*range(number - LONGEST, number), *(number + later for later in (1, 3, 6, 9, 12))]
         path = {}
         for other in known:
@@ -50,3 +50,34 @@ def test_slow_wander_of_whole_frames_is_averaged_over_the_longest_path():
 def test_a_pan_through_slow_wander_is_followed():
     shifts = wander(160, 0.8, np.random.default_rng(2))
     assert np.abs((steadied(shifts, velocity=2.0) - shifts[LONGEST:-12]).mean(0)).max() < 0.2
+
+
+PLACE = LONGEST + 10
+TIMES = np.arange(PLACE + 20.0) - PLACE
+TURNS = {
+    "stops now": np.minimum(TIMES, 0),
+    "stopped two frames ago": np.minimum(TIMES, -2),
+    "starts in the next frame": np.maximum(TIMES, 1),
+    "turns gradually": 0.04 * TIMES**2,
+}
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_a_camera_that_turns_stays_where_it_is(turn):
+    shifts = 2 * TURNS[turn][:, None] * [0.8, 0.6]
+    assert np.abs(steadied(shifts, numbers=[PLACE]) - shifts[PLACE]).max() < 0.01
+
+
+def test_a_stop_is_not_rounded_because_whole_frames_wander():
+    rng, stop = np.random.default_rng(3), 2 * TURNS["stops now"][:, None] * [1, 0]
+    wanders = [0.3 * wander(len(TIMES), 0.8, rng) for _ in range(200)]
+    ends = np.concatenate([steadied(stop + one, numbers=[PLACE]) for one in wanders])
+    # A parabola alone lies 1.2 pixels off.
+    assert np.abs(ends.mean(0)).max() < 0.1
+
+
+def test_a_camera_at_rest_is_as_steady_as_though_it_never_stopped():
+    wanders = [wander(LONGEST + 72, 0.8, np.random.default_rng(seed)) for seed in range(8)]
+    ends = np.concatenate([steadied(0.3 * one) for one in wanders])
+    of_mean = 0.3 * np.sqrt((1 + 0.8) / (1 - 0.8) / (LONGEST + 13))
+    assert np.sqrt(np.square(ends).mean()) < 1.3 * of_mean

@@ -5,13 +5,14 @@ Symbols
 k : the frame; j a frame before it, or after it within the window
 G_j : affine map from the first frame of the scene to frame j, homogeneous, pixels about the centre of the image
 P_j : motion of the camera from frame k to frame j, ``G_j G_k⁻¹ − 1``, of shape (2, 3)
-T : map from frame k to the steadied frame, ``1 +`` the value at k of a polynomial fitted to the P_j
+T : map from frame k to the steadied frame, ``1 +`` the value at k of a curve fitted to the P_j
 e : by what turbulence moves whole frames, pixels
 ε_i, σ_i : what fit i leaves, root mean square; standard deviation of its value at k, from ε_i and ρ_i
 ρ_i : correlation of what fit i leaves in successive frames: a mean varies √((1 + ρ) / (1 − ρ)) times as much by it
+n : number of frames of the first fit; S : sum of squares that one of its curves leaves
 
 Turbulence moves whole frames as well, but at random about where the camera is, and a camera rests, pans and zooms at
-constant velocity for a while.  A parabola through a few frames follows whatever the camera does and averages little; a
+constant velocity for a while.  A curve through a few frames follows whatever the camera does and averages little; a
 line through many averages much, without a lag behind a pan; a mean of many is best while the camera rests.  The fits
 are taken in this order, as long as each agrees with the one before (the intersection of confidence intervals of
 Goldenshluger and Nemirovski 1997): fit i has the share ::
@@ -20,6 +21,11 @@ Goldenshluger and Nemirovski 1997): fit i has the share ::
 
 of what those before leave, without the last factor for the first.  Where even the first leaves more than e, the camera
 shakes, and T = 1.
+
+The path of a camera that turns is a parabola, that of one which starts or stops at once two lines that meet, at any
+frame with two others on either side.  The first fit is the mean of these curves by their probability.  All have three
+coefficients for either axis, so with a scatter that is not known their likelihoods are ``S^(3 − n)``; beforehand a
+parabola is as probable as two lines.  σ_1 includes by how much the curves differ at k.
 
 G_j is the median over the earlier neighbours of frame j of the map to them and on to frame j; those far away keep
 errors from adding up with every frame.
@@ -83,15 +89,19 @@ def smooth_motion(path: Mapping[int, Matrix], tolerance: float, shape: tuple[int
         if one_sided and value is None:
             # At the ends of a scene the first line is extrapolated.
             share *= _AT_ENDS
-        before, (value, left, spread) = value, _fit(times[near], seen[near], weights[near], order)
-        squares = [camera_size(one, shape) ** 2 for one in left.reshape(-1, 2, 3)]
-        size = float(np.sqrt(np.average(squares, weights=weights[near])))
+        curves, now = _curves(times[near], weights[near], order), int(np.sum(times[near] < 0))
+        likely = _likelihoods(seen[near] - curves @ seen[near], weights[near], shape)
+        curve = np.tensordot(likely, curves, 1)
+        fitted = curve @ seen[near]
+        before, value, left = value, fitted[now], seen[near] - fitted
+        size, between = _size(left, weights[near], shape), _size(curves[:, now] @ seen[near] - value, likely, shape)
         share *= 1 / (1 + (size / max(tolerance, _LEAST)) ** 8)
         if before is not None:
             differs = camera_size((value - before).reshape(2, 3), shape)
             share *= 1 / (1 + (differs / max((_DOUBT if order else _RESTING) * doubt, _LEAST)) ** 4)
         smooth = smooth + share * (value - smooth)
-        doubt = size * spread * _alikeness(times[near], left)
+        within = size * float(np.linalg.norm(curve[now])) * _alikeness(times[near], left)
+        doubt = float(np.hypot(within, between))
     return smooth.reshape(2, 3)
 
 
@@ -102,7 +112,7 @@ def without_shake(path: Mapping[int, Matrix], order: int) -> Matrix:
     """
     times, seen, _ = _samples(path)
     # With one neighbour a line fits both: the frame stays.
-    return _fit(times, seen, np.ones(len(times)), order)[0].reshape(2, 3)
+    return (_curves(times, np.ones(len(times)), order)[0] @ seen)[times == 0].reshape(2, 3)
 
 
 def homogeneous(matrix: Matrix) -> Matrix:
@@ -138,10 +148,24 @@ def _alikeness(times: Matrix, left: Matrix) -> float:
     return float(np.sqrt((1 + correlation) / (1 - correlation)))
 
 
-def _fit(times: Matrix, seen: Matrix, weights: Matrix, order: int) -> tuple[Matrix, Matrix, float]:
-    """Value at 0 of a polynomial, what it leaves, and its standard deviation over that of a frame."""
-    basis = np.stack([(times / LONGEST) ** power for power in range(order + 1)], 1)
-    root = np.sqrt(weights)
-    solve = np.linalg.pinv(basis * root[:, None]) * root
-    solution = solve @ seen
-    return solution[0], seen - basis @ solution, float(np.linalg.norm(solve[0]))
+def _curves(times: Matrix, weights: Matrix, order: int) -> Matrix:
+    """Projections of samples on a polynomial and, beside a parabola, on pairs of lines that meet at a frame."""
+    line, root = times / LONGEST, np.sqrt(weights)
+    bases = [line[:, None] ** np.arange(order + 1)]
+    if order == 2:
+        bases += [np.stack([line**0, line, np.abs(line - bend)], 1) for bend in line[2:-2]]
+    basis = np.stack(bases)
+    return np.asarray(basis @ (np.linalg.pinv(basis * root[:, None]) * root), np.float64)
+
+
+def _likelihoods(left: Matrix, weights: Matrix, shape: tuple[int, ...]) -> Matrix:
+    """Probability of a polynomial and of pairs of lines from what each leaves, their scatter not being known."""
+    sizes = np.array([max(_size(one, weights, shape), _LEAST) for one in left])
+    likely = (sizes.min() / sizes) ** (2 * (len(weights) - 3))
+    likely[1:] /= max(len(left) - 1, 1)
+    return np.asarray(likely / likely.sum(), np.float64)
+
+
+def _size(left: Matrix, weights: Matrix, shape: tuple[int, ...]) -> float:
+    """Root mean square of what a fit leaves, pixels."""
+    return camera_size(np.sqrt(np.average(left**2, axis=0, weights=weights)).reshape(2, 3), shape)
