@@ -47,7 +47,8 @@ def test_the_noise_of_the_filtered_image_is_that_by_which_two_clips_of_one_scene
     difference = np.float32((found[0].filtered.image - found[1].filtered.image) / np.sqrt(2))
     true = fit_noise_spectrum([difference], found[0].filtered.image)
     for one in found:
-        assert one.noise.deviation == pytest.approx(true.deviation, rel=0.25)
+        # Two clips also differ by how their flows follow the noise of each centroid, which one clip cannot tell.
+        assert 0.7 < one.noise.deviation / true.deviation < 1.05
 
 
 def test_a_border_that_few_frames_show_does_not_count_for_the_noise(clean):
