@@ -1,4 +1,4 @@
-"""What the training frames say: how strong the turbulence was; the structure, the noise and the blur of their image.
+"""What the training frames say about the air, and about structure, noise and blur of their image.
 
 It is gathered while the training frames are in memory, and used when they are gone.
 """

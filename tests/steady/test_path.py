@@ -76,7 +76,7 @@ def test_a_stop_is_not_rounded_because_whole_frames_wander():
     assert np.abs(ends.mean(0)).max() < 0.1
 
 
-def test_a_camera_at_rest_is_as_steady_as_though_it_never_stopped():
+def test_a_camera_at_rest_loses_little_by_turns_that_are_possible():
     wanders = [wander(LONGEST + 72, 0.8, np.random.default_rng(seed)) for seed in range(8)]
     ends = np.concatenate([steadied(0.3 * one) for one in wanders])
     of_mean = 0.3 * np.sqrt((1 + 0.8) / (1 - 0.8) / (LONGEST + 13))

@@ -15,11 +15,12 @@ widths; widths are relative to that of the posterior, which is about right at ev
 scatter adds to the deviation.  Of the widths whose G is as good as the largest, but for a difference that is not seen,
 the widest is chosen that is no wider than σ or than the best.
 
-What is removed is the median of three widths: this bold one, a cautious one, which is its geometric mean with σ_16, and
-the one that the image alone tells, which so decides between the two at most.  Where G expects a loss, the cautious one
-is removed, or nothing.  The networks know more simulators than the theory of the posterior, and are wrong where a clip
-is like none of them; the posterior errs elsewhere, most of all where it has two peaks.  The image alone is right about
-text, charts and streets, and takes soft scenes for blurred ones.
+What is removed is the median of three widths: this bold one, a cautious one, which is its geometric mean with σ_16
+and usually narrower, and the one that the image alone tells, if it tells any, which so chooses between the other two.
+Where G expects a loss from the median, the cautious width is removed; where G expects one from that too, nothing is.
+The networks know more simulators than the theory of the posterior, and are wrong where a clip is like none of them; the
+posterior errs elsewhere, most of all where it has two peaks.  The image alone is right about text, charts and streets,
+and takes soft scenes for blurred ones.
 ``benchmarks/decisions/blur.md`` compares them.
 
 ``python benchmarks/blur_training.py`` makes the clips, trains and judges the networks, and writes ``learnt_blur.npz``.
@@ -61,10 +62,11 @@ _SCALES = (1, 2, 4, 8)
 
 @dataclass(frozen=True, eq=False)
 class LearntBlur:
-    """What the networks say about the blur of an image, and what follows from them and from the posterior."""
+    """What the networks say about the blur of an image, and what follows from them, the posterior and the image."""
 
     width: Float64Array  # (3,): 16 %, 50 % and 84 % quantiles of the width, pixels
     removed: float  # width of the blur to remove, pixels; 0 if a loss is expected
+    cautious: float  # the same without the image alone
 
 
 def blur_features(
@@ -143,8 +145,8 @@ def learnt_blur(
     bold = usual * _widest(gains, float(quantiles[1]) / usual)
     cautious = (bold * low) ** 0.5
     middle = sorted((bold, cautious, alone or cautious))[1]
-    safe = (width for width in (middle, cautious) if np.interp(width / usual, FACTORS, gains) >= 0)
-    return LearntBlur(quantiles, next(safe, 0.0))
+    safe = [width if np.interp(width / usual, FACTORS, gains) >= 0 else 0.0 for width in (middle, cautious)]
+    return LearntBlur(quantiles, safe[0] or safe[1], safe[1])
 
 
 def _widest(gains: Float64Array, most: float) -> float:

@@ -25,8 +25,8 @@ does not blur it.
 The air and the lens look alike in 1 and 3, and the air alone varies.
 
 The width that is reported is learnt from simulated clips, for which this posterior and all that the witnesses measure
-are the input.  The width that is removed is the geometric mean of a learnt one and of the 16 % quantile of this
-posterior, and its exponent is that of this posterior (:mod:`turbrestore.blur.learnt`).
+are the input.  The width that is removed follows from a learnt one, from this posterior and from the image alone
+(:mod:`turbrestore.blur.learnt`); its exponent is that of this posterior.
 
 Constants of the likelihoods were set on simulated clips; ``benchmarks/results/blur_calibration.md`` is of others.
 """
@@ -127,10 +127,12 @@ def estimate_posterior(
     noise: NoiseSpectrum,
     runtime: Runtime = DEFAULT,
     exponent: float | None = None,
+    cautious: bool = False,
 ) -> tuple[ImageEvidence | None, BlurPosterior]:
     """Estimate the blur of an image (H, W) of some noise; none is removed where it shows nothing or a loss is expected.
 
     ``exponent`` is that of the transfer function, if it is given; the width is still chosen for that of the posterior.
+    ``cautious`` leaves what the image alone tells out of the width, for callers who weigh it themselves.
     """
     evidence, variation = image_evidence(image, runtime), witnesses.variation
     ratio = None if variation is None else variation.with_power(image)
@@ -142,7 +144,8 @@ def estimate_posterior(
     features = blur_features(image, np.array(widths), variation, ratio, evidence, noise, facts)
     alone = evidence.estimate.sigma if evidence.estimate.blurred else 0.0
     found, shape = learnt_blur(features, by_theory.width, alone), exponent or by_theory.exponent
-    return evidence, replace(by_theory, removed=found.removed, exponent=shape, width=found.width)
+    removed = found.cautious if cautious else found.removed
+    return evidence, replace(by_theory, removed=removed, exponent=shape, width=found.width)
 
 
 def blur_posterior(

@@ -46,7 +46,8 @@ class FilterParams:
         Frames whose flows are measured against the same image; 1 is the paper's, more run side by side.
     sharpness : float
         β: how strongly locally sharp frames are preferred; 0 gives every frame the same scalar gain.  A frame weighs
-        exp(β z) for a sharpness z, standardised and free of noise, so noise lowers the preference by itself.
+        exp(β z), where z is its sharpness in standard deviations, less the share of them that noise explains; so noise
+        lowers the preference by itself.
     image_noise : float, optional
         Z₀: variance of a registered frame about the image, squared intensity; by default measured on the first block.
     image_drift : float
@@ -142,7 +143,7 @@ class Filtered:
     image_noise : float
         Z₀, squared intensity.
     sharpness_weight : float
-        β.
+        β, the setting ``sharpness``.
     noise_gain : float
         Variance of the noise of the image, relative to that with equal weights.
     mean_flow : ndarray, float32, shape (H, W, 2)

@@ -196,7 +196,7 @@ def _find_blur(image: FloatArray, said: WindowWitnesses, count: float, runtime: 
         noise = witnesses.frame_noise.scaled(1 / count)
     variation = None if witnesses.variation is None else replace(witnesses.variation, frames=round(count))
     witnesses = replace(witnesses, independent_frames=count, variation=variation)
-    evidence, posterior = estimate_posterior(grey, witnesses, noise, runtime)
+    evidence, posterior = estimate_posterior(grey, witnesses, noise, runtime, cautious=True)
     if evidence is None:
         return 0.0, KOLMOGOROV
     ratio = None if variation is None else variation.with_power(grey)

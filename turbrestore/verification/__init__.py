@@ -1,1 +1,1 @@
-"""How far a restored image is to be believed: structure, halves of the clip, repetition, deviation of pixels."""
+"""How far a restored image can be trusted: structure, halves of the clip, repetition, deviation of pixels."""

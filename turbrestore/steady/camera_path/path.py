@@ -23,9 +23,10 @@ of what those before leave, without the last factor for the first.  Where even t
 shakes, and T = 1.
 
 The path of a camera that turns is a parabola, that of one which starts or stops at once two lines that meet, at any
-frame with two others on either side.  The first fit is the mean of these curves by their probability.  All have three
-coefficients for either axis, so with a scatter that is not known their likelihoods are ``S^(3 − n)``; beforehand a
-parabola is as probable as two lines.  σ_1 includes by how much the curves differ at k.
+frame with two others on either side.  The first fit is the mean of these curves by their probability, ε_1 that of the
+parabola.  All have three coefficients along each axis, so where what they leave is independent and of unknown scatter,
+their likelihoods are ``S^(3 − n)``; a priori, the parabola is as probable as all pairs of lines together.  σ_1 includes
+by how much the curves differ at k.
 
 G_j is the median over the earlier neighbours of frame j of the map to them and on to frame j; those far away keep
 errors from adding up with every frame.
@@ -41,7 +42,8 @@ from .camera import Matrix, camera_size
 
 # Frames before k that are kept.
 LONGEST = 48
-# Fits: frames on either side of k, and order of the polynomial; fewest frames of a fit.
+# Fits: frames on either side of k, and order of the polynomial, which of the second order has pairs of lines beside it;
+# fewest frames of a fit.
 _FITS = (6, 2), (6, 1), (12, 1), (24, 1), (LONGEST, 1), (LONGEST, 0)
 _FEWEST = 4
 # κ, less for a static camera, since that is the assumption that a slow pan breaks.
@@ -49,7 +51,7 @@ _DOUBT, _RESTING = 2.0, 1.5
 _AT_ENDS = 0.5
 # Frames from one to the next whose residuals are compared, and the greatest correlation ρ that they count for.
 _SUCCESSIVE, _MOST_ALIKE = 2, 0.95
-# Least e and κ σ, pixels, so that an exact fit has a share.
+# Least e, ε and κ σ, pixels, so that an exact fit has a share.
 _LEAST = 1e-3
 
 
@@ -90,18 +92,19 @@ def smooth_motion(path: Mapping[int, Matrix], tolerance: float, shape: tuple[int
             # At the ends of a scene the first line is extrapolated.
             share *= _AT_ENDS
         curves, now = _curves(times[near], weights[near], order), int(np.sum(times[near] < 0))
-        likely = _likelihoods(seen[near] - curves @ seen[near], weights[near], shape)
-        curve = np.tensordot(likely, curves, 1)
-        fitted = curve @ seen[near]
-        before, value, left = value, fitted[now], seen[near] - fitted
-        size, between = _size(left, weights[near], shape), _size(curves[:, now] @ seen[near] - value, likely, shape)
-        share *= 1 / (1 + (size / max(tolerance, _LEAST)) ** 8)
+        remains = seen[near] - curves @ seen[near]
+        likely = _likelihoods(remains, weights[near], shape)
+        left = np.tensordot(likely, remains, 1)
+        before, value = value, -left[now]
+        # Lines that meet also fit a camera that shakes.
+        share *= 1 / (1 + (_size(remains[0], weights[near], shape) / max(tolerance, _LEAST)) ** 8)
         if before is not None:
             differs = camera_size((value - before).reshape(2, 3), shape)
             share *= 1 / (1 + (differs / max((_DOUBT if order else _RESTING) * doubt, _LEAST)) ** 4)
         smooth = smooth + share * (value - smooth)
-        within = size * float(np.linalg.norm(curve[now])) * _alikeness(times[near], left)
-        doubt = float(np.hypot(within, between))
+        within = np.sqrt(likely @ np.square(curves[:, now]).sum(axis=1)) * _size(left, weights[near], shape)
+        between = _size(left[now] - remains[:, now], likely, shape)
+        doubt = float(np.hypot(within * _alikeness(times[near], left), between))
     return smooth.reshape(2, 3)
 
 
@@ -167,5 +170,5 @@ def _likelihoods(left: Matrix, weights: Matrix, shape: tuple[int, ...]) -> Matri
 
 
 def _size(left: Matrix, weights: Matrix, shape: tuple[int, ...]) -> float:
-    """Root mean square of what a fit leaves, pixels."""
+    """Root mean square of what a fit leaves, or of how far curves differ, pixels."""
     return camera_size(np.sqrt(np.average(left**2, axis=0, weights=weights)).reshape(2, 3), shape)
