@@ -33,8 +33,8 @@ from ..core.robust import spread
 from ..registration.warp import inside, warp
 from ..runtime.scratch import drop_pages
 
-# Largest share of unseen edges, where registration leaves more than a share of the variance over the frames.  66 right
-# results have up to 1.7 % unseen; six clips of waves on water have 4.3 to 16 %, and leave 41 to 100 %.
+# Largest share of unseen edges, where registration leaves more than a share of the variance over the frames; figures in
+# benchmarks/decisions/guards.md.
 UNSEEN, LEFT = 0.03, 0.3
 # Share of what is left that lasts, from which the scene itself changes.  Recorded and simulated clips of scenes that do
 # not change have up to 0.04, textures that live for a tenth of the clip and longer 0.17 and more.
