@@ -15,9 +15,9 @@ widths; widths are relative to that of the posterior, which is about right at ev
 scatter adds to the deviation.  Of the widths whose G is as good as the largest, but for a difference that is not seen,
 the widest is chosen that is no wider than σ or than the best.
 
-What is removed is the median of three widths: this bold one, a cautious one, which is its geometric mean with σ_16
-and usually narrower, and the one that the image alone tells, if it tells any, which so chooses between the other two.
-Where G expects a loss from the median, the cautious width is removed; where G expects one from that too, nothing is.
+What is removed is the median of three widths: this one, its geometric mean with σ_16, and the one that the image alone
+tells, which so chooses between the other two; it is 0 where the image shows no blur.  Where G expects a loss from the
+median, the narrower of the first two is removed; where G expects one from that too, nothing is.
 The networks know more simulators than the theory of the posterior, and are wrong where a clip is like none of them; the
 posterior errs elsewhere, most of all where it has two peaks.  The image alone is right about text, charts and streets,
 and takes soft scenes for blurred ones.
@@ -66,7 +66,7 @@ class LearntBlur:
 
     width: Float64Array  # (3,): 16 %, 50 % and 84 % quantiles of the width, pixels
     removed: float  # width of the blur to remove, pixels; 0 if a loss is expected
-    cautious: float  # the same without the image alone
+    cautious: float  # the narrower of the two widths that the image alone chooses between, pixels; 0 likewise
 
 
 def blur_features(
@@ -143,9 +143,9 @@ def learnt_blur(
     gains = out[:, 2:].mean(axis=0)
     gains = gains - gains[0]
     bold = usual * _widest(gains, float(quantiles[1]) / usual)
-    cautious = (bold * low) ** 0.5
-    middle = sorted((bold, cautious, alone or cautious))[1]
-    safe = [width if np.interp(width / usual, FACTORS, gains) >= 0 else 0.0 for width in (middle, cautious)]
+    middling = (bold * low) ** 0.5
+    candidates = sorted((bold, middling, alone))[1], min(bold, middling)
+    safe = [width if np.interp(width / usual, FACTORS, gains) >= 0 else 0.0 for width in candidates]
     return LearntBlur(quantiles, safe[0] or safe[1], safe[1])
 
 
