@@ -1,6 +1,7 @@
 """Make the pictures of the README and of the documentation, all from clips that turbrestore synthesizes itself.
 
-Run ``python docs/make_figures.py``; names of groups (``film``, ``gallery``, ``stages``, ``recipes``) make only these.
+Run ``python docs/make_figures.py``; names of groups (``film``, ``gallery``, ``stages``, ``videos``, ``recipes``) make
+only these.
 
 The photographs come with scikit-image and are in the public domain or under CC0: the photographer by Lav Varshney, the
 cat by Stefan van der Walt, brick and gravel from CC0Textures.  What else is shown is drawn by
@@ -32,6 +33,7 @@ from turbrestore.synthesis.scenes import picture, printed_words, resolution_char
 
 SIDE = 224
 FILM_SIDE, FILM_HEIGHT = 256, 384
+VIDEO_FRAMES = 60
 LARGEST_RECIPE, LARGEST_ROW = 120_000, 180_000
 # Name, scene, strength of the air, number of frames, and noise of the camera.
 GALLERY = {
@@ -57,7 +59,7 @@ def gallery_clip(name: str) -> Clip:
 @cache
 def steadied_street() -> FloatArray:
     """Frames of the street, steadied."""
-    return np.stack([frame.image for frame in tr.steady_frames(gallery_clip("street").frames)])
+    return steadied_beside(gallery_clip("street").frames)[1]
 
 
 def make_film() -> None:
@@ -104,6 +106,24 @@ def make_stages() -> None:
     strengths = {STRENGTHS[name]: film(shown.truth, STRENGTHS[name], 40) for name in STRENGTHS}
     stages.seeing(strengths, shown)
     stages.steady(gallery_clip("street").frames, steadied_street())
+
+
+def make_videos() -> None:
+    """Frames of videos one after the other, beside the steadied ones."""
+    wide = film(picture("camera", SIDE, SIDE + VIDEO_FRAMES), STRENGTHS["medium"], VIDEO_FRAMES)
+    videos = {
+        "traffic": (gallery_clip("street").frames, steadied_street()),
+        "pan": steadied_beside(np.stack([frame[:, k : k + SIDE] for k, frame in enumerate(wide)])),
+        "words": steadied_beside(gallery_clip("words").frames),
+    }
+    for name, (before, after) in videos.items():
+        pictures = [row({"video through haze": a, "steadied": b}) for a, b in zip(before, after, strict=True)]
+        save_film(f"video_{name}", pictures, milliseconds=80, quality=60)
+
+
+def steadied_beside(frames: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Frames, and the same steadied."""
+    return frames, np.stack([frame.image for frame in tr.steady_frames(frames)])
 
 
 def make_recipes() -> None:
@@ -155,7 +175,13 @@ RECIPES: dict[str, dict[str, tuple[str, int | None]]] = {
         "moving objects": ("moving.mkv", 30),
     },
 }
-GROUPS = {"film": make_film, "gallery": make_gallery, "stages": make_stages, "recipes": make_recipes}
+GROUPS = {
+    "film": make_film,
+    "gallery": make_gallery,
+    "stages": make_stages,
+    "videos": make_videos,
+    "recipes": make_recipes,
+}
 
 
 def main() -> None:

@@ -142,7 +142,7 @@ def test_networks_get_the_quantiles_of_the_posterior_and_its_shape_is_removed(mo
 
     def learnt(_features, widths, alone):
         given.extend([widths, alone])
-        return LearntBlur(np.array([1.0, 1.2, 1.4]), 1.1)
+        return LearntBlur(np.array([1.0, 1.2, 1.4]), 1.1, 0.9)
 
     monkeypatch.setattr("turbrestore.blur.posterior.learnt_blur", learnt)
     witnesses = measure_witnesses(frames, flows, image, BlurWitnesses(0.0, 12.0))
@@ -152,6 +152,8 @@ def test_networks_get_the_quantiles_of_the_posterior_and_its_shape_is_removed(mo
     assert given[1] == evidence.estimate.sigma > 1
     assert found.removed == 1.1 and found.width.tolist() == [1.0, 1.2, 1.4]
     assert found.exponent == (exponent or by_theory.exponent)
+    _, careful = estimate_posterior(image, witnesses, white_noise(0.001), exponent=exponent, cautious=True)
+    assert careful.removed == 0.9
 
 
 def test_one_wrong_witness_is_outvoted():

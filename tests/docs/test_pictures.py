@@ -12,6 +12,7 @@ def test_pictures_are_small() -> None:
     assert sum(SIZES.values()) < 4_000_000
     assert SIZES["haze.webp"] < 1_500_000
     assert all(size < 180_000 for name, size in SIZES.items() if name.startswith(("gallery_", "stage_", "recipe_")))
+    assert all(size < 600_000 for name, size in SIZES.items() if name.startswith("video_"))
 
 
 def test_gallery_shows_every_scene_and_stage() -> None:

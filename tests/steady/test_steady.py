@@ -189,7 +189,8 @@ def test_width_of_what_is_remembered_gradually_becomes_that_of_its_own_image():
 def test_noise_of_what_is_remembered_is_that_of_a_mean_of_the_frames_it_holds(monkeypatch):
     said, noises, frames = WindowWitnesses(BlurWitnesses(0.5, 11.0, frame_noise=white_noise(0.04)), 0.5), [], []
 
-    def estimate(image, witnesses, noise, runtime):
+    def estimate(image, witnesses, noise, runtime, cautious):
+        assert cautious
         noises.append(noise.deviation)
         frames.append(witnesses.independent_frames)
         return None, None
