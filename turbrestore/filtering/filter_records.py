@@ -60,7 +60,7 @@ class FilterParams:
     training: Literal["filter", "skip"] = "filter"
     inner_iterations: int = 2
     block: int = 24
-    sharpness: float = 1.0
+    sharpness: float = 2.0
     image_noise: float | None = None
     image_drift: float = 0.0
     prior_frames: float = 0.0
