@@ -23,7 +23,7 @@ from turbrestore.io.output import atomic_write
 
 ROOT = Path(__file__).resolve().parent.parent
 # What tables depend on.
-CODE = ("turbrestore", "benchmarks", ":!benchmarks/results")
+CODE = ("turbrestore", "benchmarks", ":!benchmarks/results", ":!benchmarks/decisions")
 LINE = re.compile(r"(?m)^\*turbrestore (?P<version>\S+), revision (?P<revision>\S+), (?P<day>[\d-]+); .*\*\n\n")
 CPU = Path("/proc/cpuinfo")
 

@@ -186,7 +186,7 @@ def work(order: Order) -> ClipRow:
     try:
         # A process that was killed while it did the same may have left a result.
         restoration, source = restore_clip(dataclasses.replace(order, overwrite=True, quiet=True))
-        x, y, width, height = restoration.crop
+        height, width = restoration.image.shape[:2]
         checks = restoration.verdict.checks
         known = {check.text for check in checks}
         middle = len(source) // 2
@@ -200,7 +200,7 @@ def work(order: Order) -> ClipRow:
             seconds=float(sum(restoration.seconds.values())),
             checks="; ".join(map(str, checks)),
             remarks="; ".join(remark for remark in source.warnings if remark not in known),
-            before=thumbnail_uri(source.read(middle, middle + 1)[0][y : y + height, x : x + width]),
+            before=thumbnail_uri(source.read(middle, middle + 1)[0][restoration.shown]),
             after=thumbnail_uri(restoration.image),
         )
     except Exception as error:  # whatever happens to one clip, the others are restored

@@ -299,7 +299,7 @@ class _Facts:
             "sigma": self.figures.sigma,
             "mean_displacement": float(np.mean(self.figures.displacement)),
             "moving_share": float(np.mean(self.figures.moving)),
-            "let_go_share": float(np.mean(self.figures.let_go)),
+            "replaced_share": float(np.mean(self.figures.replaced)),
             "verdict": dataclasses.asdict(self.figures.verdict),
         }
 

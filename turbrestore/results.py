@@ -157,10 +157,15 @@ class Restoration:
         return math.sqrt(float(variance_of(self.centroid.flows).sum(axis=-1).mean()))
 
     @property
+    def shown(self) -> tuple[slice, slice]:
+        """Rows and columns of the frames that the image shows; see :attr:`crop`."""
+        x, y, width, height = self.crop
+        return slice(y, y + height), slice(x, x + width)
+
+    @property
     def sharpening(self) -> float:
         """Sharpness of the image relative to the temporal mean; NaN where the mean has no contrast."""
-        x, y, width, height = self.crop
-        mean = self.mean[y : y + height, x : x + width]
+        mean = self.mean[self.shown]
         return sharpness(self.image, mean) if np.ptp(mean) > 0 else math.nan
 
     @property
@@ -171,8 +176,7 @@ class Restoration:
 
     def plot(self) -> Figure:
         """Draw the temporal mean beside the result; ConfigurationError without Matplotlib."""
-        x, y, width, height = self.crop
-        return plot_images({"mean": self.mean[y : y + height, x : x + width], "result": self.image})
+        return plot_images({"mean": self.mean[self.shown], "result": self.image})
 
     def __repr__(self) -> str:
         height, width = self.image.shape[:2]
@@ -291,5 +295,4 @@ def _disputed(restoration: Restoration) -> float:
     """Share of the detail of the result on which the frames do not agree."""
     if restoration.disagreement is None:
         return 0.0
-    x, y, width, height = restoration.crop
-    return disputed_detail(restoration.disagreement, restoration.mean[y : y + height, x : x + width])
+    return disputed_detail(restoration.disagreement, restoration.mean[restoration.shown])

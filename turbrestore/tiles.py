@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,22 +170,14 @@ def join_filtered(
         for name in (*_AVERAGED, "flow_states", "innovations"):
             records.setdefault(name, []).append(np.asarray(getattr(part, name)))
     areas = _areas(tiles)
-
-    def average(name: str) -> np.ndarray:
-        return np.average(records[name], axis=0, weights=areas)
-
+    averages: dict[str, Any] = {name: np.average(records[name], axis=0, weights=areas) for name in _AVERAGED}
     return Filtered(
         image=image,
         variance=variance,
         flow_states=np.concatenate(records["flow_states"], axis=1),
-        gains=average("gains"),
         innovations=np.sqrt(np.average(np.square(records["innovations"]), axis=0, weights=areas)),
-        sharpness=average("sharpness"),
-        shares=average("shares"),
-        image_noise=float(average("image_noise")),
-        sharpness_weight=float(average("sharpness_weight")),
-        noise_gain=float(average("noise_gain")),
         mean_flow=mean_flow,
+        **averages,
     )
 
 

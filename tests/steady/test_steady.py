@@ -296,12 +296,12 @@ def test_a_memory_that_has_gone_astray_is_let_go():
     for _ in range(12):
         memory = remembered(memory, none)
     assert memory.held[40:56, 40:56].min() > 10
-    assert memory.let_go < 0.01
+    assert memory.replaced < 0.01
     # It slips by a period with every frame agreeing, but for a corner that does not repeat.
     astray = dataclasses.replace(memory, image=np.roll(wall, 5, 1))
     for _ in range(8):
         astray = remembered(astray, np.full((96, 96, 2), (-5.0, 0.0), np.float32))
-    assert astray.let_go > 0.3
+    assert astray.replaced > 0.3
 
 
 class TestCamera:

@@ -26,8 +26,7 @@ def detail_spectrum(restoration: Restoration) -> DetailSpectrum | None:
     """Return signal and noise of the filtered image, None unless its noise was measured."""
     if restoration.noise is None or restoration.filtered is None:
         return None
-    x, y, width, height = restoration.crop
-    grey = np.ascontiguousarray(luminance(restoration.filtered.image)[y : y + height, x : x + width])
+    grey = np.ascontiguousarray(luminance(restoration.filtered.image)[restoration.shown])
     # The mean of every window is taken out, and with it most of the lowest ring.
     noise = restoration.noise.power[1:]
     signal = np.maximum(window_powers(grey).mean(axis=0)[1:] - noise, 0)

@@ -214,10 +214,9 @@ def _uncertainty_facts(restoration: Restoration) -> Iterator[Fact]:
     deviation = restoration.uncertainty
     if deviation is None:
         return
-    x, y, width, height = restoration.crop
     known = np.isfinite(deviation)
     # Few frames show the border, and its deviation says nothing of the rest.
-    interior = known & (coverage(restoration.centroid.flows)[y : y + height, x : x + width] >= SEEN)
+    interior = known & (coverage(restoration.centroid.flows)[restoration.shown] >= SEEN)
     if interior.any():
         middle, high = (255 * float(value) for value in np.quantile(deviation[interior], (0.5, 0.95)))
         note = f"of 255, in the median of what nine frames in ten show; below {high:.1f} in 95 % of it"

@@ -70,11 +70,10 @@ class Gallery:
 
 def stages(restoration: Restoration, frame: FloatArray) -> dict[str, FloatArray]:
     """Return the images of all stages, cropped like the result. A last stage equal to the result is left out."""
-    x, y, width, height = restoration.crop
     images = {"frame": frame, "mean": restoration.mean, "centroid": restoration.centroid.image}
     if restoration.filtered is not None:
         images["filtered"] = restoration.filtered.image
-    images = {key: image[y : y + height, x : x + width] for key, image in images.items()}
+    images = {key: image[restoration.shown] for key, image in images.items()}
     last = next(reversed(images))
     if all(
         (one == other).all() for one, other in zip(iter_parts(restoration.image), iter_parts(images[last]), strict=True)

@@ -48,7 +48,7 @@ class SteadyFigures:
     # Root mean square of the displacement that was removed, pixels.
     displacement: list[float] = field(default_factory=list)
     moving: list[float] = field(default_factory=list)  # share of the image that moves
-    let_go: list[float] = field(default_factory=list)  # share of the image that is averaged less
+    replaced: list[float] = field(default_factory=list)  # share of the image that is averaged less
     scenes: int = 0
     sigma: float = 0.0  # width of the blur that was removed, pixels
     seconds: float = 0.0  # time of the run
@@ -60,7 +60,7 @@ class SteadyFigures:
         self.sigma = frame.sigma
         self.displacement.append(frame.displacement)
         self.moving.append(float(frame.moving.mean()))
-        self.let_go.append(frame.let_go)
+        self.replaced.append(frame.replaced)
 
     @property
     def verdict(self) -> Verdict:
@@ -71,7 +71,7 @@ class SteadyFigures:
         count, moves = counted(len(self.moving), "frame"), share_words(float(np.mean(self.moving)))
         gained = f"{count} with {' and '.join(removed)} removed; {moves} of the image moves"
         checks = [write_check(CheckKind.INPUT, remark) for remark in self.remarks if isinstance(remark, Doubt)]
-        astray = float(np.mean(self.let_go))
+        astray = float(np.mean(self.replaced))
         if astray >= _ASTRAY:
             checks.append(write_check(CheckKind.DRIFT, share_words(astray)))
         return Verdict(gained, tuple(checks))

@@ -88,7 +88,7 @@ class Memory:
     pose: Matrix  # (3, 3): E
     mean: FloatArray  # (H, W): B
     distances: FloatArray  # (H, W, 2): e_Z and e_F, squared intensity
-    let_go: float  # share of the image that the last frame replaced because it differed from B
+    replaced: float  # share of the image that the last frame replaced because it differed from B
 
 
 def remember(
@@ -139,9 +139,9 @@ def remember(
     pulled = camera_flow(max(1 - kept, _PULL) * (camera - expected), shape, grid)
     inverse = enlarged(inverted((1 - kept) * own + pulled, shape), shape)
     mean = memory.mean + (placed - memory.mean) / np.float32(min(frames, _RECENT))
-    let_go = float(1 - agrees.mean())
+    replaced = float(1 - agrees.mean())
     estimate = warp(memory.image + innovation, inverse)
-    return Memory(estimate, sample_linear((held,), inverse), frames, memory.pose, mean, distances, let_go)
+    return Memory(estimate, sample_linear((held,), inverse), frames, memory.pose, mean, distances, replaced)
 
 
 def _in_light(memory: Memory, seen: FloatArray) -> Memory:

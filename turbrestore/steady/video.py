@@ -68,7 +68,7 @@ class SteadyFrame:
         Width of the blur that was removed from a frame, pixels.
     starts_scene : bool
         Whether a new scene starts here.
-    let_go : float
+    replaced : float
         Share of the accumulated image, or of the estimate, that this frame replaced, because the frames lay nearer to
         their own mean or were sharper (:mod:`turbrestore.steady.fusion`).
     """
@@ -79,7 +79,7 @@ class SteadyFrame:
     displacement: float
     sigma: float
     starts_scene: bool
-    let_go: float
+    replaced: float
 
 
 def steady_frames(
@@ -294,7 +294,7 @@ def _checked(estimate: Memory, frame: DewarpedFrame, steadied: Matrix) -> Memory
     share = enlarged(share, shape)
     image = seen.image + for_channels(share, seen.image) * (estimate.image - seen.image)
     held = 1 + share * (estimate.held - 1)
-    return replace(estimate, image=image, held=held, let_go=max(estimate.let_go, float(1 - share.mean())))
+    return replace(estimate, image=image, held=held, replaced=max(estimate.replaced, float(1 - share.mean())))
 
 
 def _placed(image: FloatArray, moving: NDArray[np.bool_], offset: Matrix) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -322,5 +322,5 @@ def _sharpened(
         displacement=frame.displacement,
         sigma=sigma,
         starts_scene=frame.starts_scene,
-        let_go=memory.let_go,
+        replaced=memory.replaced,
     )

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import av
     from av.container import OutputContainer
 
-# Without this option Matroska numbers its segment and tracks at random; with it the same frames give the same bytes.
+# Without this option Matroska numbers its segment and tracks at random; with it the same packets give the same bytes.
 _WRITE_OPTIONS = {"fflags": "+bitexact"}
 _GREY_DEPTHS = {8: "gray", 10: "gray10le", 12: "gray12le", 14: "gray14le", 16: "gray16le"}
 _RGB_DEPTHS = {8: "bgr0", 10: "gbrp10le", 12: "gbrp12le", 14: "gbrp14le", 16: "gbrp16le"}
@@ -90,8 +90,9 @@ def write_container(
 
     The depth of FFV1 is the next of 8, 10, 12, 14 and 16 bits, that of HEVC 8 or 10 bits, that of H.264 8 bits, which
     every player shows; values fill the range; 32 is written as the largest of them. The same frames give the same
-    bytes. The file says how its colours are coded: by the matrix of BT.709, or of BT.2020 for HDR, with the primaries
-    and transfer of ``colour``, numbers of ITU-T H.273, or those of BT.709.
+    bytes in FFV1; x264 and x265 may code them differently from one run to the next. The file says how its colours are
+    coded: by the matrix of BT.709, or of BT.2020 for HDR, with the primaries and transfer of ``colour``, numbers of
+    ITU-T H.273, or those of BT.709.
     """
     import av
 
