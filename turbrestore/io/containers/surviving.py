@@ -1,7 +1,7 @@
 """Frames that survive damage within a stream: from the next key frame on nothing depends on what was lost.
 
 Networks and disks lose packets in the middle of recordings.  The demultiplexer marks a packet as corrupt where it finds
-a gap, and the decoder fails or marks its frame; what either conceals is not found.
+a gap, and the decoder, which is told not to conceal damage, fails or marks its frame; what either misses is not found.
 """
 
 from __future__ import annotations
