@@ -107,9 +107,12 @@ def test_a_blur_of_pixels_alone_is_no_doubt(restoration):
     assert changed.verdict.checks == ()
 
 
-def test_a_shift_of_the_whole_frame_is_no_doubt_about_the_geometry(restoration):
-    shifts = 40 * np.random.default_rng(0).standard_normal((len(restoration.centroid.flows), 1, 1, 2))
-    shaken = (restoration.centroid.flows + shifts).astype(np.float32)
+@pytest.mark.parametrize("motion", ["shift", "zoom", "turn"])
+def test_motion_of_the_whole_frame_is_no_doubt_about_the_geometry(restoration, motion):
+    y, x = np.mgrid[-56:56, -56:56].astype(np.float32)
+    mode = {"shift": np.ones((1, 1, 2)), "zoom": np.stack([x, y], -1), "turn": np.stack([-y, x], -1)}[motion]
+    sizes = np.random.default_rng(0).standard_normal((len(restoration.centroid.flows), 1, 1, 1))
+    shaken = (restoration.centroid.flows + sizes * mode * 40 / np.abs(mode).max()).astype(np.float32)
     dynamics = replace(restoration.dynamics, R=1600.0)
     moved = replace(restoration, centroid=replace(restoration.centroid, flows=shaken), dynamics=dynamics)
     assert moved.verdict.checks == ()

@@ -238,7 +238,7 @@ def _checks(restoration: Restoration, motion: float) -> Iterator[Check]:
         yield write_check(CheckKind.UNSEEN, share_words(restoration.unseen))
     if restoration.is_mean or filtered is None or restoration.dynamics is None:
         return
-    # A shift of the whole frame bends no line, and no copy is nearer for it.
+    # A shift, turn or zoom of the whole frame bends no line.
     of_air = _share_of_air(restoration.centroid.flows)
     period, largest = repetition(restoration.mean), _LARGEST * of_air * motion / math.sqrt(2)
     if period < 2 * largest:
@@ -285,10 +285,15 @@ def _is_too_sharp(restoration: Restoration) -> bool:
 
 
 def _share_of_air(flows: FloatArray) -> float:
-    """Share of the motion, flows (T, H, W, 2), that is no shift of whole frames."""
+    """Share of the motion, flows (T, H, W, 2), that is no shift, turn or zoom of whole frames."""
     some = flows[:, ::4, ::4] - flows[:, ::4, ::4].mean(axis=0)
-    shifts = np.median(some, axis=(1, 2), keepdims=True)
-    return float(np.linalg.norm(some - shifts) / max(float(np.linalg.norm(some)), ROUNDING))
+    bent = some - np.median(some, axis=(1, 2), keepdims=True)
+    y, x = (axis - axis.mean() for axis in np.mgrid[: some.shape[1], : some.shape[2]].astype(np.float32))
+    # Displacements (dx, dy) by a zoom, and by a turn about the middle.
+    for mode in (np.stack([x, y], axis=-1), np.stack([-y, x], axis=-1)):
+        size = np.einsum("thwc,hwc->t", bent, mode) / max(float(np.square(mode).sum()), ROUNDING)
+        bent -= np.multiply.outer(size, mode)
+    return float(np.linalg.norm(bent) / max(float(np.linalg.norm(some)), ROUNDING))
 
 
 def _disputed(restoration: Restoration) -> float:
