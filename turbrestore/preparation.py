@@ -118,9 +118,12 @@ def _detectors(static_mask: str, source: FrameSource) -> list[Find]:
         find_stripes,
         find_pixel_pattern,
         *([partial(find_overlay, mask=mask)] if with_overlays else ()),
+        # Colours before light: a channel that changes by itself would be taken for a change of the light.
         find_white_balance,
         find_light,
+        # What is left when the light has been evened out blinks by itself.
         find_two_states,
+        # The range is that of the frames as they are registered; objects are told by their contrast in it.
         find_range,
         *([find_moving_objects] if with_overlays else ()),
     ]

@@ -35,8 +35,8 @@ from .guards import BACK_OFF, GuardParams, GuardReading, evaluate_guards
 _BYTES, _CHANNEL_BYTES = 22, 2
 # Bytes per pixel and channel of the results of two attempts.
 _RESULTS_BYTES = 8
-# The widest blur that is found, pixels, and the least shorter side of an image in widths of its blur: a wider one
-# leaves nothing to restore.
+# The widest blur that is found, pixels, and the least shorter side of an image in widths of its blur; both chosen:
+# a wider one leaves nothing to restore.
 WIDEST, SIGMAS_A_SIDE = 21.0, 8
 # Most attempts; if the last one fails, no blur is removed.
 _MOST_TRIES = 10

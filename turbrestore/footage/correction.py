@@ -18,7 +18,8 @@ from ..core.decision import Decision
 from ..io.source import Window
 from .levels import Levels
 
-# Takes the number of a frame in the file, its intensities (h, w[, 3]), and the rows and columns that they are.
+# Takes the number of a frame in the file, its intensities (h, w[, 3]), which stay as they are, and the rows and columns
+# of the file that they show.
 Apply = Callable[[int, FloatArray, Window], FloatArray]
 
 
@@ -36,7 +37,7 @@ class Correction:
 
     decisions: tuple[Decision, ...]
     apply: Apply | None = None  # None: it is only named
-    small: FloatArray | None = None  # reduced frames after it, if it shows in them
+    small: FloatArray | None = None  # reduced frames after it, if it shows in them: later detectors see these
     hidden: NDArray[np.bool_] | None = None  # (H, W): pixels of the scene that no frame shows
     picture: Window | None = None  # rows and columns outside of which there is no scene
     put_back: PutBack | None = None
