@@ -196,10 +196,10 @@ def _fitted(stack: NDArray[np.uint8], numbers: Sequence[int], model: _Model, pla
     """Fit a model to the moving objects of a sample; None if there are none, or so many that they are the scene."""
     parts = [model.at(placement.place(number)) for number in numbers]
     large = [_foreground(_grey(plane), part.without_small()) for plane, part in zip(stack, parts, strict=True)]
-    masks = [_foreground(_grey(plane), part) for plane, part in zip(stack, parts, strict=True)]
     if not _is_precipitation(stack, large, parts):
         model, parts, masks = model.without_small(), [part.without_small() for part in parts], large
     else:
+        masks = [_foreground(_grey(plane), part) for plane, part in zip(stack, parts, strict=True)]
         # Rain widens the spread of the frames, under which some of it hides.
         model = _median_model(stack, numbers, placement, masks, model.reach)
         parts = [model.at(placement.place(number)) for number in numbers]
