@@ -50,6 +50,8 @@ PRINTED, SIZES = ("DejaVu Sans", "DejaVu Serif", "DejaVu Sans Mono", "STIXGenera
 # Kinds of scenes, simulators, and their shares of the clips.
 SCENES = {"leaves": 0.25, "text": 0.14, "print": 0.1, "blades": 0.1, "bars": 0.04, "craters": 0.1, "photograph": 0.27}
 SHARES = {"screens": 0.27, "kernels": 0.18, "lens": 0.17, "mixed": 0.13, "near": 0.06, "none": 0.13, "close": 0.06}
+# A sheet with words in a heat chamber, which is drawn only if it is asked for.
+CHAMBER = "chamber"
 # Pixels around a clip from which displacement brings in what the frame does not show at rest.
 MARGIN = 32
 # Sides of the rectangle around each pixel of a title within which most rings are that the removal of a blur makes.
@@ -76,8 +78,10 @@ def simulate(seed: int, simulator: str | None = None) -> SimulatedClip:
     rng = np.random.default_rng(seed)
     drawn = str(rng.choice(list(SHARES), p=list(SHARES.values())))
     simulator = simulator or drawn
-    side = int(rng.integers(168, 224)) if simulator in ("near", "close") else int(rng.integers(112, 177))
+    side = int(rng.integers(168, 224)) if simulator in ("near", "close", CHAMBER) else int(rng.integers(112, 177))
     name = str(rng.choice(list(SCENES), p=list(SCENES.values())))
+    if simulator == CHAMBER:
+        name = "sheet"
     scene = draw_scene(name, side + 2 * MARGIN, rng)
     count = int(np.exp(rng.uniform(np.log(4), np.log(100))))
     frames, truth = _SIMULATORS[simulator](scene, count, rng)
@@ -150,6 +154,31 @@ def _print(side: int, rng: np.random.Generator) -> FloatArray:
     dark, bright = rng.uniform(0, 0.35), rng.uniform(0.5, 1)
     printed = np.float32(dark) + np.float32(bright - dark) * np.asarray(page, np.float32) / 255
     return 1 - printed if rng.uniform() < 0.15 else printed
+
+
+def _sheet(side: int, rng: np.random.Generator) -> FloatArray:
+    """Print a few words on a sheet of paper that lies askew before something dark."""
+    from matplotlib import font_manager
+    from PIL import Image, ImageDraw, ImageFont
+
+    path = font_manager.findfont(str(rng.choice(PRINTED)), fallback_to_default=False)
+    height = float(np.exp(rng.uniform(np.log(16), np.log(40))))
+    font, inner = ImageFont.truetype(path, int(height)), side - 2 * MARGIN
+    page = Image.new("L", (2 * side, 2 * side), 0)
+    ink, (left, top) = ImageDraw.Draw(page), rng.uniform(0, 0.25, 2) * inner + side / 2 + MARGIN
+    width, length = rng.uniform(0.8, 1.6, 2) * inner
+    ink.rectangle((left, top, left + width, top + length), fill=255)
+    row, step = top + rng.uniform(0.5, 1.5) * height, rng.uniform(1.3, 2.2) * height
+    while row + height < top + length:
+        word = "".join(rng.choice(list(string.ascii_lowercase), int(rng.integers(3, 10))))
+        ink.text((left + rng.uniform(0.05, 0.4) * width, row), word, fill=int(rng.uniform(0, 110)), font=font)
+        row += step
+    page = page.rotate(float(rng.uniform(-15, 15)), Image.Resampling.BICUBIC)
+    shown = np.asarray(page, np.float32)[side // 2 : side // 2 + side, side // 2 : side // 2 + side] / 255
+    dark, bright = rng.uniform(0, 0.25), rng.uniform(0.3, 0.9)
+    texture = cv2.GaussianBlur(rng.standard_normal((side, side)).astype(np.float32), (0, 0), rng.uniform(1, 8))
+    lit = np.float32(dark) + np.float32(bright - dark) * shown
+    return np.clip(lit + np.float32(rng.uniform(0, 0.02)) * texture / texture.std(), 0, 1)
 
 
 def _blades(side: int, rng: np.random.Generator) -> FloatArray:
@@ -228,6 +257,7 @@ _SCENES = {
     "bars": _bars,
     "craters": _craters,
     "photograph": _photograph,
+    "sheet": _sheet,
 }
 
 
@@ -347,6 +377,10 @@ def _close(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[Flo
     return _kernels(scene, max(count, 10), rng, (2.0, 7.5))
 
 
+def _chamber(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    return _kernels(scene, max(count, 10), rng, (2.5, 8.0))
+
+
 def _none(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     flows = _flows(count, scene.shape, rng)
     return _moved(scene, [scene] * count, flows * (rng.uniform() < 0.6))
@@ -360,6 +394,7 @@ _SIMULATORS = {
     "near": _near,
     "close": _close,
     "none": _none,
+    CHAMBER: _chamber,
 }
 
 

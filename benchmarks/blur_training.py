@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 import torch
 from blur_calibration import CORE, registered
-from blur_simulators import SHARES, SimulatedClip, simulate
+from blur_simulators import CHAMBER, SHARES, SimulatedClip, simulate
 from provenance import publish
 
 from turbrestore import DeconvolutionParams, TurbrestoreError, pipeline
@@ -72,7 +72,7 @@ def main() -> int:
         kind.add_argument("folder", type=Path)
     make.add_argument("first", type=int)
     make.add_argument("last", type=int)
-    make.add_argument("--simulator", choices=SHARES)
+    make.add_argument("--simulator", choices=[*SHARES, CHAMBER])
     train.add_argument("--write", type=Path)
     given = parser.parse_args()
     if given.what == "make":
