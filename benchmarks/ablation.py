@@ -39,7 +39,7 @@ VARIANTS = {
     "single centroid": replace(DEFAULT, centroid=CentroidParams(mode="single")),
     "residual dropped": replace(DEFAULT, filter=FilterParams(residual="drop")),
     "no sharpness weights": replace(DEFAULT, filter=FilterParams(sharpness=0.0)),
-    "β = 1": replace(DEFAULT, filter=FilterParams(sharpness=1.0)),
+    "β = 1/2": replace(DEFAULT, filter=FilterParams(sharpness=0.5)),
     "β = 2": replace(DEFAULT, filter=FilterParams(sharpness=2.0)),
 }
 # Run anew from the filtered image, with the blur that the default has found.

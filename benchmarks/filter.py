@@ -34,7 +34,7 @@ VARIANTS = {
     "inner 1": replace(DEFAULT, inner_iterations=1),
     "inner 3": replace(DEFAULT, inner_iterations=3),
     "sharpness 0": replace(DEFAULT, sharpness=0.0),
-    "sharpness 1": replace(DEFAULT, sharpness=1.0),
+    "sharpness 2": replace(DEFAULT, sharpness=2.0),
     "sharpness 3": replace(DEFAULT, sharpness=3.0),
     "drop": replace(DEFAULT, residual="drop"),
     "drop, sharpness 0": replace(DEFAULT, residual="drop", sharpness=0.0),

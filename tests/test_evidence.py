@@ -41,13 +41,14 @@ def clean():
     return 0.1 + 0.8 * make_sequence(seed=5, count=24, size=SIZE, scene="camera", noise=0.0, rms=0.5).frames
 
 
-@pytest.mark.parametrize("rho", [0.0, 0.5])
-def test_the_noise_of_the_filtered_image_is_that_by_which_two_clips_of_one_scene_differ(clean, rho):
+@pytest.mark.parametrize(("rho", "least"), [(0.0, 0.75), (0.5, 0.7)])
+def test_the_noise_of_the_filtered_image_is_that_by_which_two_clips_of_one_scene_differ(clean, rho, least):
     found = [restore(with_smooth_noise(clean, seed, rho), FILTERED) for seed in (1, 2)]
     difference = np.float32((found[0].filtered.image - found[1].filtered.image) / np.sqrt(2))
     true = fit_noise_spectrum([difference], found[0].filtered.image)
     for one in found:
-        assert one.noise.deviation == pytest.approx(true.deviation, rel=0.25)
+        # Two clips also differ by how their flows follow the noise of each centroid, which one clip cannot tell.
+        assert least < one.noise.deviation / true.deviation < 1.05
 
 
 def test_a_border_that_few_frames_show_does_not_count_for_the_noise(clean):

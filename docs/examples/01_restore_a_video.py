@@ -119,7 +119,7 @@ for decision in result.decisions:
 # %% [markdown]
 # The mean flow falls once and then no further; the rest is the bias of the flow method, and the iteration stops. The
 # singular values have no edge at n: the states hold most of the motion, not all. The gain starts at 1, for nothing is
-# known before the first frame, and later jumps by a factor of ten and more between sharp frames and soft ones. The
+# known before the first frame, and later changes by up to a factor of ten between sharp frames and soft ones. The
 # width of the blur is where the cost is lowest.
 
 # %% [markdown]

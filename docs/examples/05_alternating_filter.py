@@ -145,6 +145,6 @@ _ = axes[0].legend()
 
 # %% [markdown]
 # With all frames alike the gain is one over the number of frames, with the residual kept or not: the filter is a
-# running mean. Preferring sharp frames, it jumps by a factor of ten and more between one frame and the next, and the
+# running mean. Preferring sharp frames, it changes by a factor of up to six from one frame to the next, and the
 # shares follow the true blur, which the filter does not know. The innovation is larger after the training frames: the
 # model foresees flows it was fitted to better than new ones.

@@ -29,7 +29,7 @@ from .conftest import STAGES, WORDS, contents, interrupt, spy
         (["--train=9"], 0, "centroid: training_frames was [0, 8, 1] and is [0, 9, 1]"),
         (["--roi=0,0,32,30"], 0, "centroid: region was"),
         (["--dynamics.rank=2"], 1, "flow model: dynamics.rank was None and is 2"),
-        (["--filter.sharpness=1"], 2, "filter: filter.sharpness was None and is 1"),
+        (["--filter.sharpness=2"], 2, "filter: filter.sharpness was 1.0 and is 2"),
         (["--keep-best=50%"], 2, "filter: keep_best was 1"),
         (["--frames=0:20"], 0, "centroid: frames was [0, 28, 1] and is [0, 20, 1]"),
         (["--sigma=1"], 3, "deconvolution: deconvolution.sigma was None and is 1"),
@@ -47,7 +47,7 @@ def test_a_changed_setting_concerns_what_depends_on_it(ended, monkeypatch, capsy
 
 
 def test_what_starts_again_is_what_a_new_run_gives(ended):
-    change = ["--filter.sharpness=1", "--overwrite"]
+    change = ["--filter.sharpness=2", "--overwrite"]
     assert main([*WORDS, "--resume", *change]) == 0
     resumed = contents(ended)
     assert main([*WORDS, *change]) == 0

@@ -1,8 +1,7 @@
 """Alternating-estimation Kalman filter over the image and the state of its flow (paper 3, section 4).
 
 Symbols as in :mod:`turbrestore.filtering.image_state` (ρ̂, Σ, Z) and :mod:`turbrestore.filtering.flow_state` (ξ̂, P);
-Ŵ is the flow that frames are registered by, and β the weight of sharpness, given or chosen by
-:mod:`turbrestore.filtering.frame_statistics`.
+Ŵ is the flow that frames are registered by, and β the weight of sharpness.
 
 Given Ŵ the image is a linear state, given ρ the flow is, so each frame updates one after the other:
 
@@ -282,9 +281,8 @@ def _measure_settings(
         runtime.threads,
     )
     device = find_device(runtime.device)
-    beta = statistics.sharpness_weight if params.sharpness is None else params.sharpness
     runtime = replace(runtime, device=device)
-    return PassSettings(dynamics, load_record(statistics, device), params, beta, flow_params, runtime)
+    return PassSettings(dynamics, load_record(statistics, device), params, flow_params, runtime)
 
 
 def _prior(image: FloatArray, image_noise: float, dynamics: FlowDynamics, params: FilterParams) -> FilterState:
@@ -331,9 +329,9 @@ def _to_filtered(at: _Position, settings: PassSettings) -> Filtered:
         sharpness=np.array([record.sharpness for record in records]),
         shares=information / information.sum(),
         image_noise=settings.statistics.image_noise,
-        sharpness_weight=settings.sharpness_weight,
+        sharpness_weight=settings.params.sharpness,
         # The mean square of weights exp(β z), with z normal of variance v, over the square of their mean.
-        noise_gain=float(np.exp(settings.sharpness_weight**2 * store(settings.statistics.score_variance).mean())),
+        noise_gain=float(np.exp(settings.params.sharpness**2 * store(settings.statistics.score_variance).mean())),
         mean_flow=mean_flow,
     )
 

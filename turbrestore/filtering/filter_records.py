@@ -44,9 +44,10 @@ class FilterParams:
         state of the last of them, and the image stays in their geometry.
     block : int
         Frames whose flows are measured against the same image; 1 is the paper's, more run side by side.
-    sharpness : float, optional
-        β: how strongly locally sharp frames are preferred; 0 gives every frame the same scalar gain.  By default
-        chosen on the first block, at most 2: it falls with the noise.
+    sharpness : float
+        β: how strongly locally sharp frames are preferred; 0 gives every frame the same scalar gain.  A frame weighs
+        exp(β z), where z is its sharpness in standard deviations, less the share of them that noise explains; so noise
+        lowers the preference by itself.
     image_noise : float, optional
         Z₀: variance of a registered frame about the image, squared intensity; by default measured on the first block.
     image_drift : float
@@ -59,7 +60,7 @@ class FilterParams:
     training: Literal["filter", "skip"] = "filter"
     inner_iterations: int = 2
     block: int = 24
-    sharpness: float | None = None
+    sharpness: float = 1.0
     image_noise: float | None = None
     image_drift: float = 0.0
     prior_frames: float = 0.0
@@ -69,8 +70,7 @@ class FilterParams:
             require(value in known, f"{name}: expected one of {', '.join(known)}, found {value!r}")
         require_between("inner_iterations", self.inner_iterations, 1, 100)
         require_between("block", self.block, 1, 10_000, "frames")
-        if self.sharpness is not None:
-            require_between("sharpness", self.sharpness, 0, 10)
+        require_between("sharpness", self.sharpness, 0, 10)
         if self.image_noise is not None:
             require_between("image_noise", self.image_noise, 1e-12, 1)
         require_between("image_drift", self.image_drift, 0, 1)
@@ -143,7 +143,7 @@ class Filtered:
     image_noise : float
         Z₀, squared intensity.
     sharpness_weight : float
-        β, given or chosen.
+        β, the setting ``sharpness``.
     noise_gain : float
         Variance of the noise of the image, relative to that with equal weights.
     mean_flow : ndarray, float32, shape (H, W, 2)

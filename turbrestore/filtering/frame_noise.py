@@ -71,7 +71,6 @@ class FrameStatistics:
     score_scale: Stack  # (H, W): factor from a deviation of the local sharpness to z; 0 where an object has moved
     score_variance: Stack  # (H, W): v, variance of z over the frames
     left_out: float  # κ, 0 to 1/4
-    sharpness_weight: float  # β for which the noise that the weights add is worth the sharpness that they gain
     mean_frame: Stack  # (H, W): mean luminance of the registered frames without outliers
     deviation: Stack  # (H, W): variance of the registered frames about it, locally averaged, squared intensity
     # (H, W): median luminance of the registered frames, and the square of their median deviation from it, scaled to a

@@ -39,7 +39,6 @@ class PassSettings:
     dynamics: FlowDynamics
     statistics: FrameStatistics  # its maps are on the device
     params: FilterParams
-    sharpness_weight: float  # β, given or chosen
     flow_params: FlowParams
     runtime: Runtime  # with the device that was found
 
@@ -117,7 +116,7 @@ def register(tracked: TrackedFrame, settings: PassSettings) -> RegisteredFrame |
     if tracked.pixels is None or tracked.measured is None:
         return None
     flow = tracked.measured if settings.params.residual == "keep" else flow_of(settings.dynamics, tracked.state.mean)
-    return register_frame(tracked.pixels, flow, settings.statistics, settings.sharpness_weight)
+    return register_frame(tracked.pixels, flow, settings.statistics, settings.params.sharpness)
 
 
 def _measure_flows(items: list[TrackedFrame], reference: FlowReference) -> list[TrackedFrame]:

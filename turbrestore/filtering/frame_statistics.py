@@ -3,7 +3,7 @@
 Symbols
 -------
 Z₀ : variance of a registered frame about the image before sharpness is taken into account (paper 3, eq. 15)
-β : weight of sharpness; κ what its window leaves out, see :func:`turbrestore.filtering.frame_noise.local_sharpness`
+κ : what the window of the sharpness leaves out, see :func:`turbrestore.filtering.frame_noise.local_sharpness`
 
 All frames are warped twice: for mean and variance, and again to leave out what deviates.  Some are warped once more,
 for a median, which moving objects do not change.
@@ -55,8 +55,6 @@ _SOBEL_NOISE, _SOBEL_AREA = 12 / 64, 3.0
 _MIDDLE, _LEAST_SHARE = 0.25, 0.15
 # Rings of the highest frequencies, chosen: where scenes have little, and noise is told best.
 _HIGHEST = 4
-# Largest β, the variance of noise that is worth one unit of squared gradient, and steps of the search for β.
-_LARGEST_WEIGHT, _PRICE, _BISECTIONS = 2.0, 10.0, 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +104,6 @@ def measure_frame_statistics(
     sharpness, spread, explained, left_out = _leave_middle_out(moments, coloured, sensor_noise)
     # Where a scene without noise is flat, the square of the scale exceeds single precision.
     scale = _score_scale(sharpness, spread, explained)
-    weight = _sharpness_weight(sharpness, spread - explained, scale**2 * spread, float(sensor_noise.mean()) / count)
     # Near a moving object the flow follows it, and a frame may be sharp without showing the scene.
     scale *= 1 - smooth(covered.astype(np.float32), SHARPNESS_WINDOW)
     return FrameStatistics(
@@ -118,7 +115,6 @@ def measure_frame_statistics(
         score_scale=scale.astype(np.float32),
         score_variance=(scale**2 * spread).astype(np.float32),
         left_out=left_out,
-        sharpness_weight=weight,
         mean_frame=mean_frame,
         deviation=deviation,
         median=centre,
@@ -286,21 +282,3 @@ def _score_scale(sharpness: np.ndarray, spread: np.ndarray, explained: np.ndarra
     deviation = np.sqrt(np.maximum(spread - explained, 0.0))
     whole = spread + (_LEAST_SPREAD * sharpness) ** 2
     return np.divide(deviation, whole, out=np.zeros_like(whole), where=whole > 0)
-
-
-def _sharpness_weight(sharpness: np.ndarray, spread: np.ndarray, score_variance: np.ndarray, noise: float) -> float:
-    """β at which the noise that the weights add reaches its price, the energy of the gradient that they gain.
-
-    Weights ``exp(β z)`` raise the noise of the fused image, of variance ``noise``, by exp(β² v).  A deviation of the
-    sharpness, of variance ``spread`` without noise, is one of the squared gradient: its square over the sharpness is
-    the energy that blur takes and gives from frame to frame.
-    """
-    gained = max(float(spread.sum() / max(np.abs(sharpness).sum(), ROUNDING**2)), 0.0)
-    allowed = _PRICE * gained / max(noise, ROUNDING**2)
-    low, high = 0.0, _LARGEST_WEIGHT
-    if float(np.expm1(high**2 * score_variance).mean()) <= allowed:
-        return high
-    for _ in range(_BISECTIONS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if float(np.expm1(middle**2 * score_variance).mean()) <= allowed else (low, middle)
-    return low

@@ -35,7 +35,7 @@ from ..runtime.scratch import drop_pages
 
 # Largest share of unseen edges, where registration leaves more than a share of the variance over the frames; figures in
 # benchmarks/decisions/guards.md.
-UNSEEN, LEFT = 0.1, 0.3
+UNSEEN, LEFT = 0.03, 0.3
 # Share of what is left that lasts, from which the scene itself changes.  Recorded and simulated clips of scenes that do
 # not change have up to 0.04, textures that live for a tenth of the clip and longer 0.17 and more.
 LASTING = 0.1
