@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from blur_calibration import CORE, registered
 from blur_simulators import CHAMBER, SHARES, SimulatedClip, simulate
-from provenance import publish
+from provenance import origin, publish
 
 from turbrestore import DeconvolutionParams, TurbrestoreError, pipeline
 from turbrestore.blur import posterior
@@ -80,9 +80,13 @@ def main() -> int:
         make_clips(given.folder, given.first, given.last, given.simulator)
         return 0
     clips = read_clips(given.folder)
-    publish(table_of(clips), given.write)
+    table = table_of(clips)
+    publish(table, given.write)
     every = train_networks(clips, np.ones(len(clips.simulators), bool))
-    np.savez_compressed(WEIGHTS, **{name: values.astype(np.float16) for name, values in every.items()})
+    scores = table.splitlines()[-1]
+    about = f"{origin()} python benchmarks/blur_training.py train, {len(clips.simulators)} clips; {scores}"
+    weights = {name: values.astype(np.float16) for name, values in every.items()}
+    np.savez_compressed(WEIGHTS, about=about, **weights)
     return 0
 
 

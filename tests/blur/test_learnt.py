@@ -1,5 +1,6 @@
 """Networks that tell the blur to remove: their evaluation, what they read, and what follows from the gains."""
 
+import re
 from importlib.resources import files
 
 import cv2
@@ -132,6 +133,8 @@ def test_networks_read_what_is_measured(side):
         assert (np.diff(found.width) > 0).all() and 0.4 < found.width[1] < 4
 
 
-def test_the_file_of_the_weights_is_small():
+def test_the_file_of_the_weights_is_small_and_says_what_it_is_of():
     path = files("turbrestore.blur").joinpath("learnt_blur.npz")
     assert len(path.read_bytes()) < 300_000
+    with path.open("rb") as stream, np.load(stream) as held:
+        assert re.search(r"revision \w+, .* blur_training\.py train, [\d,]+ clips; \| a fifth", str(held["about"]))

@@ -191,4 +191,5 @@ def _weights() -> dict[str, Float64Array]:
     """Layers of the networks (n, outputs, inputs), and middle and scale of the features."""
     path = files("turbrestore.blur").joinpath("learnt_blur.npz")
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as held:
-        return {name: held[name].astype(np.float64) for name in held.files}
+        # Beside the weights the file says from which revision, command and clips it is, and how well they do.
+        return {name: held[name].astype(np.float64) for name in held.files if name != "about"}
