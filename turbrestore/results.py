@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-# Error of the geometry that is seen, pixels; chosen: a line bent by one shows as a step.
+# Error of the geometry that is seen, pixels; chosen: a line that is bent by one pixel shows a step.
 _SEEN_BEND = 1.0
 # Frames whose halves are too few to tell what they agree on.
 FEW = 8

@@ -215,7 +215,7 @@ def explain_structure(reading: StructureReading) -> tuple[Decision, ...]:
     if reading.explained:
         return ()
     reason = (
-        f"{reading.unseen:.0%} of the edges of the filtered image occur in fewer than half of the frames (bound "
+        f"{reading.unseen:.1%} of the edges of the filtered image occur in fewer than half of the frames (bound "
         f"{UNSEEN:.0%}), and registration leaves {reading.left:.0%} of the differences of the frames (bound {LEFT:.0%})"
     )
     return (Decision("structure", "the mean of the frames is the result", reason),)

@@ -329,6 +329,37 @@ class TestDamage:
         assert {*range(10), *range(20, 30)} <= set(kept) and 20 < len(kept) < 30
         np.testing.assert_array_equal(source.read(), whole[kept])
 
+    def test_what_a_strict_decoder_refuses_of_a_sound_clip_is_no_damage(self, tmp_path):
+        path = encode(tmp_path / "a.h264", scene(count=12), "libx264", "yuv420p", "rgb24", bf="3")
+        whole, data = open_frames(path).read(), path.read_bytes()
+        # A message of four bytes where sixteen belong.
+        start = data.index(b"\0\0\1\x65")
+        path.write_bytes(data[:start] + b"\0\0\1\x06\x05\x04\1\2\3\4\x80" + data[start:])
+        np.testing.assert_array_equal(open_frames(path).read(), whole)
+        assert len(open_frames(path, skip_damaged=True)) == 12
+
+    def test_frames_before_a_key_frame_in_an_open_group_are_no_damage(self, tmp_path):
+        options = {"g": "10", "bf": "3", "x264_params": "open-gop=1:keyint=10:min-keyint=10"}
+        path = encode(tmp_path / "a.mp4", scene(count=40), "libx264", "yuv420p", "rgb24", **options)
+        with av.open(str(path)) as container, av.open(str(tmp_path / "b.mp4"), "w") as output:
+            source = container.streams.video[0]
+            stream, groups = output.add_stream_from_template(source), 0
+            for packet in container.demux(source):
+                groups += packet.is_keyframe
+                if groups > 1 and packet.size > 0:
+                    packet.stream = stream
+                    output.mux(packet)
+        for skip in (False, True):
+            assert len(open_frames(tmp_path / "b.mp4", skip_damaged=skip).read()) >= 29
+
+    def test_a_recording_that_ends_within_a_frame_is_read(self, tmp_path):
+        path = encode(tmp_path / "a.ts", scene(30, 144, 192), "libx264", "yuv420p", "rgb24", bf="3", crf="8")
+        whole, data = open_frames(path).read(), path.read_bytes()
+        path.write_bytes(data[: -188 * 4])
+        read = open_frames(path).read()
+        # The decoder conceals what the last frame lacks.
+        assert len(read) >= 29 and (np.abs(read - whole[: len(read)]).max(axis=(1, 2, 3)) == 0).sum() >= 28
+
     @pytest.mark.parametrize("part", range(1, 9))
     def test_any_damaged_byte_of_a_slice_footer_is_found(self, tmp_path, part):
         path = grey_ffv1(tmp_path / "a.mkv", slices="4")

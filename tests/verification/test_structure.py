@@ -36,6 +36,7 @@ def under_waves(scene, count=24, seed=0):
     return np.array(frames, np.float32)
 
 
+# Of seeds 0 to 5, 2 has the least share of unseen edges.
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_where_the_image_keeps_waves_the_mean_is_the_result(seed):
     rock = cv2.GaussianBlur(SCENES["camera"](SIDE, SIDE), (0, 0), 1.2) * 0.5 + 0.2

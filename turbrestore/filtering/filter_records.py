@@ -45,9 +45,9 @@ class FilterParams:
     block : int
         Frames whose flows are measured against the same image; 1 is the paper's, more run side by side.
     sharpness : float
-        β: how strongly locally sharp frames are preferred; 0 gives every frame the same scalar gain.  A frame weighs
-        exp(β z), where z is its sharpness in standard deviations, less the share of them that noise explains; so noise
-        lowers the preference by itself.
+        β: how strongly locally sharp frames are preferred; 0 gives every frame the same scalar gain.  A pixel of a
+        frame weighs exp(β z), where z is its local sharpness in standard deviations, shrunk by the share of the
+        variance that noise explains; so noise lowers the preference by itself.
     image_noise : float, optional
         Z₀: variance of a registered frame about the image, squared intensity; by default measured on the first block.
     image_drift : float

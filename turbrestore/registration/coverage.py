@@ -11,7 +11,7 @@ from ..runtime.scratch import iter_frames
 from .warp import inside
 
 Rectangle = tuple[int, int, int, int]
-# Least share of the frames that show every border pixel of a cropped image; chosen: noise there is at most 5 % higher.
+# Least share of the frames that show every border pixel of a cropped image; chosen: noise there is about 5 % higher.
 SEEN = 0.9
 
 

@@ -66,7 +66,7 @@ _BESIDE = np.ones((25, 25), np.uint8)
 _LEAST_WEIGHT = 0.05
 # What weak turbulence displaces at most, which leaves nothing to the memory, and strong turbulence, pixels.
 _WEAK, _STRONG = 1.2, 1.8
-# Least g_A, chosen: what lies off the path of the camera is gone after about 12 frames.
+# Least g_A, chosen: an offset from the path of the camera falls to 1/e within 12 frames.
 _PULL = 1 / 12
 # Windows of the distance from B, pixels; weight of a frame in its mean over time, frames in B, and a distance that does
 # not count, squared intensity.

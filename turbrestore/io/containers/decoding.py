@@ -5,9 +5,10 @@ packets once without decoding them, which gives the number of frames, their time
 report (:mod:`turbrestore.io.containers.integrity`).  Frames that are marked as interlaced pass FFmpeg's filter bwdif.
 Frames are turned upright as the display matrix of the file demands.
 
-A decoder of H.264 that must not conceal damage finds about nine of ten overwritten stretches of 20 bytes; what decoders
-of other lossy codecs conceal is not found. FFmpeg converts YUV colour of more than
-8 bits to values up to 0.4 % darker than exact. Grey video is taken as full range, as its decoder returns it.
+Damage within packets of H.264 is found, because its decoder is told not to conceal it, except in the last packet, with
+which a recording may have been cut; what decoders of other lossy codecs conceal is not found. FFmpeg converts YUV
+colour of more than 8 bits to values up to 0.4 % darker than exact. Grey video is taken as full range, as its decoder
+returns it.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from ..pixels import BAYER_REMARK, PixelArray, looks_like_bayer, upright
 from ..source import FrameRange, FrameSource, check_cut_short, to_slice
 from .integrity import ends_early, ffv1_slices_intact, is_cut_short, varies_in_time
 from .pixel_formats import PixelFormat, frame_pixels, has_grey_palette, layout_of
-from .surviving import decoded, surviving
+from .surviving import SpoiledEndError, conceal_nothing, decoded, reads_strictly, surviving
 from .transfer_curves import BT709, remark_on_curve
 
 if TYPE_CHECKING:
@@ -69,6 +70,7 @@ class _Scan:
     entries: tuple[int, ...]  # those of the keyframes; none where they do not lead to a frame
     goes_on: bool = False  # whether a whole keyframe follows the first packet that is lost
     tolerant: bool = False  # whether packets that cannot be decoded are passed over
+    strict: bool = False  # whether the decoder is told not to conceal damage
 
     def entry(self, number: int) -> int | None:
         """Time stamp of the keyframe to begin with for a frame; None for the first."""
@@ -102,7 +104,11 @@ def open_container(
             colour = (int(frame.color_primaries), int(frame.color_trc)) if layout.transfer is None else (BT709, BT709)
             if codec == "rawvideo" and not layout.channels and looks_like_bayer(frame_pixels(frame, layout)):
                 notes += (BAYER_REMARK,)
-        scan = _scan(path, cut, limits)
+        with _open(path) as container:
+            # The last packet of a file that is cut short spoils only itself.
+            strict = codec == "h264" and not cut
+            strict = strict and reads_strictly(container, _video_stream(path, container, limits, strict))
+        scan = replace(_scan(path, cut, limits), strict=strict)
         # A filter for fields looks at the frames before and after.
         intra = codec in _INTRA_CODECS and scan.keyframes == scan.count and not interlaced
         if skip_damaged and not intra and not cut:
@@ -167,11 +173,7 @@ def _video_stream(
     limits.check_size(stream.width, stream.height, str(path))
     # The size in the stream can differ from that in the container.
     options = {"max_pixels": str(min(limits.max_pixels, 2**31 - 1))}
-    if strict and stream.codec_context.name == "h264":
-        options["err_detect"] = "explode"
-        # Threads for the slices of a frame keep their errors to themselves.
-        stream.codec_context.thread_type = "NONE"
-    stream.codec_context.options = options
+    stream.codec_context.options = options | (conceal_nothing(stream.codec_context) if strict else {})
     return stream
 
 
@@ -247,7 +249,7 @@ def _scan(path: Path, cut: bool, limits: Limits) -> _Scan:
 def _survivors(path: Path, scan: _Scan, limits: Limits) -> _Scan:
     """Count frames as a decoder gives them that passes over damage; without damage the scan stays as it is."""
     with _open(path) as container:
-        times, damaged = surviving(container, _video_stream(path, container, limits, strict=True))
+        times, damaged = surviving(container, _video_stream(path, container, limits, scan.strict))
     if len(damaged) == len(times):
         raise DataError(f"{path}: expected at least one whole frame, found none")
     if len(times) == scan.count and not damaged:
@@ -313,15 +315,14 @@ def _frames(
     wanted = chosen if isinstance(chosen, range) else frozenset(chosen)
     try:
         with input_errors(path), _open(path) as container:
-            # A stream that starts within a group of frames lacks references, which is no damage.
-            stream = _video_stream(path, container, limits, strict=scan.starts_whole or scan.tolerant)
+            stream = _video_stream(path, container, limits, scan.strict)
             packets = (packet for packet in container.demux(stream) if packet.size > 0 or packet.dts is None)
             numbers: Iterator[int] = itertools.count()
             if intra:
                 # Frames outside the range or between the steps are not decoded.
                 numbers = iter(chosen)
                 packets = (packet for index, packet in enumerate(packets) if packet.size == 0 or index in wanted)
-            frames = decoded(packets, scan.tolerant)
+            frames = decoded(packets, scan.tolerant, scan.strict)
             if interlaced:
                 if not scan.tolerant:
                     frames = (_check(path, frame, layout, index) for index, frame in enumerate(frames))
@@ -339,6 +340,9 @@ def _frames(
                     yield upright(frame_pixels(whole, layout), layout.orientation)
                 if number >= chosen[-1]:
                     return
+    except SpoiledEndError:
+        left = [later for later in chosen if later > number]
+        yield from _frames(path, layout, left, intra, interlaced, limits, replace(scan, strict=False))
     except av.error.FFmpegError as error:
         raise DataError(
             f"{path}: frame {number + 1} or after cannot be decoded ({error.strerror}); {_REMEDY}"
@@ -349,7 +353,7 @@ def _frame_at(stamp: int, frames: Iterator[av.VideoFrame]) -> av.VideoFrame | No
     """Decode up to the frame with a time stamp; None where there is none, or where it lacks others."""
     import av
 
-    with suppress(av.error.FFmpegError):
+    with suppress(av.error.FFmpegError, SpoiledEndError):
         for frame in frames:
             if frame.pts is not None and frame.pts >= stamp:
                 return None if frame.pts > stamp or frame.is_corrupt else frame

@@ -6,6 +6,7 @@ a gap, and the decoder, which is told not to conceal damage, fails or marks its 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -15,18 +16,55 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     import av
 
+# First packets that are tried, chosen: more than the frames that may follow a key frame in the stream and come before
+# it in time.
+_PROBED = 12
 
-def decoded(packets: Iterable[av.Packet], tolerant: bool) -> Iterator[av.VideoFrame]:
-    """Decode packets one after the other; ``tolerant`` passes over those that cannot be decoded."""
+
+class SpoiledEndError(Exception):
+    """The last packet of a stream cannot be decoded: it may have been cut."""
+
+
+def conceal_nothing(context: av.VideoCodecContext) -> dict[str, str]:
+    """Return the options with which a decoder of H.264 fails where it would conceal damage."""
+    # Threads for the slices of a frame keep their errors to themselves.  Without them only frames of several slices
+    # take longer, those of four slices twice as long.
+    context.thread_type = "NONE"
+    return {"err_detect": "explode"}
+
+
+def reads_strictly(container: av.container.InputContainer, stream: av.VideoStream) -> bool:
+    """Whether a decoder that conceals nothing reads the first packets.
+
+    It also refuses odd metadata, and frames at the start that refer to others before it, though nothing is damaged.
+    """
     import av
 
-    for packet in packets:
+    try:
+        for packet in itertools.islice(container.demux(stream), _PROBED):
+            packet.decode()
+    except av.error.FFmpegError:
+        return False
+    return True
+
+
+def decoded(packets: Iterable[av.Packet], tolerant: bool, strict: bool) -> Iterator[av.VideoFrame]:
+    """Decode packets one after the other; ``tolerant`` passes over those that cannot be decoded.
+
+    Raises SpoiledEndError where a ``strict`` decoder refuses the last packet only.
+    """
+    import av
+
+    for packet, following in itertools.pairwise(itertools.chain(packets, [None])):
+        assert packet is not None
         try:
             frames: Any = packet.decode()
-        except av.error.FFmpegError:
-            if not tolerant:
-                raise
-            continue
+        except av.error.FFmpegError as error:
+            if tolerant:
+                continue
+            if strict and (following is None or following.size == 0):
+                raise SpoiledEndError from error
+            raise
         yield from frames
 
 
