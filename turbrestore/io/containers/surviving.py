@@ -16,10 +16,6 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     import av
 
-# First packets that are tried, chosen: more than the frames that may follow a key frame in the stream and come before
-# it in time.
-_PROBED = 12
-
 
 class SpoiledEndError(Exception):
     """The last packet of a stream cannot be decoded: it may have been cut."""
@@ -34,15 +30,19 @@ def conceal_nothing(context: av.VideoCodecContext) -> dict[str, str]:
 
 
 def reads_strictly(container: av.container.InputContainer, stream: av.VideoStream) -> bool:
-    """Whether a decoder that conceals nothing reads the first packets.
+    """Whether a decoder that conceals nothing reads a stream up to the frame after its first key frame.
 
-    It also refuses odd metadata, and frames at the start that refer to others before it, though nothing is damaged.
+    It also refuses odd metadata, and frames before the key frame that refer to others, though nothing is damaged.
     """
     import av
 
+    key = None
     try:
-        for packet in itertools.islice(container.demux(stream), _PROBED):
-            packet.decode()
+        for packet in container.demux(stream):
+            key = packet.pts if key is None else key
+            frames: Any = packet.decode()
+            if any(frame.pts is None or key is None or frame.pts > key for frame in frames):
+                return True
     except av.error.FFmpegError:
         return False
     return True
