@@ -54,8 +54,8 @@ class Notices:
             ui.html("turbrestore", tag="h1", sanitize=False)
             self._name = ui.label("no clip is open").classes("name")
             self._busy = ui.label("").classes("busy").props("role=status")
-        self._error = ui.label("").classes("error").props("role=alert")
-        self._error.visible = False
+        self.error = ui.label("").classes("error").props("role=alert")
+        self.error.visible = False
 
     def name(self, clip: object) -> None:
         """Show which clip is open."""
@@ -81,8 +81,8 @@ class Notices:
 
     def tell(self, message: str) -> None:
         """Show one line above all, or none."""
-        self._error.text = printable(labelled(message))
-        self._error.visible = bool(message)
+        self.error.text = printable(labelled(message))
+        self.error.visible = bool(message)
 
 
 def labelled(message: str) -> str:

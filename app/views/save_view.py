@@ -46,6 +46,8 @@ class SaveView:
             with ui.element("div").classes("fields"):
                 ui.button("Save", on_click=self._save).props("unelevated").classes("grow")
             self._note = ui.label("").classes("note").props("role=status")
+            # Beside an error, what was saved before would look like what comes of it.
+            self._note.bind_visibility_from(self._notices.error, "visible", backward=lambda shown: not shown)
             self._command.build("Command")
 
     def opened(self) -> None:

@@ -87,6 +87,11 @@ def test_from_the_clip_to_the_saved_image(open_tab, app, monkeypatch):
     assert Path("again.png").read_bytes() == Path("saved.png").read_bytes()
     assert Path("again.png.toml").read_bytes() == Path("saved.png.toml").read_bytes()
 
+    page.get_by_label("Widths to compare, pixels").fill("1, wide")
+    press(page, "Compare widths")
+    page.get_by_role("alert").get_by_text("expected widths").wait_for()
+    page.get_by_text("Saved: saved.png, saved.png.toml").wait_for(state="hidden")
+
     press(page, "Save")
     page.get_by_role("alert").get_by_text("saved.png").wait_for()
 
