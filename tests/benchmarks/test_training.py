@@ -3,7 +3,8 @@
 import cv2
 import numpy as np
 import pytest
-from blur_simulators import SCENES, simulate
+from blur_scenes import SCENES
+from blur_simulators import simulate
 from blur_training import CORE, WIDTHS, errors_of, without_title
 
 from turbrestore.core.noise_spectrum import white_noise
