@@ -104,10 +104,11 @@ def open_container(
             colour = (int(frame.color_primaries), int(frame.color_trc)) if layout.transfer is None else (BT709, BT709)
             if codec == "rawvideo" and not layout.channels and looks_like_bayer(frame_pixels(frame, layout)):
                 notes += (BAYER_REMARK,)
-        with _open(path) as container:
-            # The last packet of a file that is cut short spoils only itself.
-            strict = codec == "h264" and not cut
-            strict = strict and reads_strictly(container, _video_stream(path, container, limits, strict))
+        # The last packet of a file that is cut short spoils only itself.
+        strict = codec == "h264" and not cut
+        if strict:
+            with _open(path) as container:
+                strict = reads_strictly(container, _video_stream(path, container, limits, strict))
         scan = replace(_scan(path, cut, limits), strict=strict)
         # A filter for fields looks at the frames before and after.
         intra = codec in _INTRA_CODECS and scan.keyframes == scan.count and not interlaced
