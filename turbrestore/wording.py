@@ -204,6 +204,12 @@ def explain_geometry(filtered: Filtered, dynamics: FlowDynamics) -> Decision:
 
 def explain_structure(reading: StructureReading) -> tuple[Decision, ...]:
     """Say that the filtered image is not the result, if registration does not explain how the frames differ."""
+    if reading.unseen > UNSEEN:
+        reason = (
+            f"{reading.unseen:.1%} of the edges of the filtered image occur in fewer than half of the frames (bound "
+            f"{UNSEEN:.0%})"
+        )
+        return (Decision("structure", "the mean of the frames is the result", reason),)
     if reading.changes:
         reason = (
             f"registration leaves {reading.left:.0%} of the differences of the frames (bound {LEFT:.0%}), and "
@@ -212,13 +218,7 @@ def explain_structure(reading: StructureReading) -> tuple[Decision, ...]:
         if reading.explained:
             return (Decision("changing scene", "no blur is removed", reason),)
         return (Decision("structure", "the mean of the frames is the result", reason),)
-    if reading.explained:
-        return ()
-    reason = (
-        f"{reading.unseen:.1%} of the edges of the filtered image occur in fewer than half of the frames (bound "
-        f"{UNSEEN:.0%}), and registration leaves {reading.left:.0%} of the differences of the frames (bound {LEFT:.0%})"
-    )
-    return (Decision("structure", "the mean of the frames is the result", reason),)
+    return ()
 
 
 def explain_few_frames(count: int, fewest: int) -> Decision:

@@ -1,14 +1,20 @@
 """Edges bound the width of the blur of a disc on black, and of nothing whose edges do not rise on either side."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
-from turbrestore.blur.edges import _widest_blur
+from turbrestore.blur.edges import _widest_blur, edge_limit
 from turbrestore.blur.estimation import estimate_blur
+from turbrestore.blur.posterior import BlurWitnesses, blur_posterior
 from turbrestore.blur.psf import GAUSSIAN, blur_otf, fused_exponent
+from turbrestore.blur.witnesses.image_evidence import image_evidence
 from turbrestore.deblurring.decisions import explain_blur
-from turbrestore.deblurring.remove_blur import remove_blur_steps
+from turbrestore.deblurring.remove_blur import find_blur, remove_blur_steps
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+from turbrestore.runtime.runtime import DEFAULT
 from turbrestore.runtime.steps import finish
 from turbrestore.synthesis.scenes import SCENES
 
@@ -58,6 +64,18 @@ def test_a_deblurred_planet_is_closer_to_the_scene(diameter, sigma):
     restored = finish(remove_blur_steps(blurred, blurred)).deconvolution.image
     before, after = (10 * np.log10(1 / np.mean((image - scene)[disc] ** 2)) for image in (blurred, restored))
     assert after > max(before + 1, 35)
+
+
+@pytest.mark.parametrize(("sky", "bounded"), [(0.0, True), (0.3, False)])
+def test_edges_bound_what_frames_tell_of_a_body_before_black_only(monkeypatch, sky, bounded):
+    image = seen(np.maximum(planet(150), sky * np.linspace(0, 1, 220, dtype=np.float32)), 1.2)
+    assert edge_limit(image, 2.4, 1.4)
+    evidence, wide = image_evidence(image), blur_posterior(None, BlurWitnesses(1.0, 40.0))
+    told = evidence, replace(wide, removed=2.4, exponent=1.4)
+    monkeypatch.setattr("turbrestore.deblurring.remove_blur.estimate_posterior", lambda *_: told)
+    _, found = find_blur(image, DeconvolutionParams(), DEFAULT, BlurWitnesses(1.0, 40.0))
+    assert found.edge_limited == bounded
+    assert found.removed == (pytest.approx(1.2, rel=0.25) if bounded else 2.4)
 
 
 @pytest.mark.parametrize("exponent", [GAUSSIAN, fused_exponent(1.5)])

@@ -172,6 +172,11 @@ def _widest_blur(image: FloatArray, exponent: float, widest: float) -> float:
     return widest
 
 
+def has_black_background(image: FloatArray) -> bool:
+    """Whether an image (H, W) is evenly dark around a body, such as a planet, whose limb may be soft."""
+    return bool(np.isfinite(_background(image, estimate_noise(image))))
+
+
 def _background(image: FloatArray, noise: float) -> float:
     """Level below which pixels are black, or that of no pixel if there is no black background."""
     black, white = np.percentile(image, (_BLACK, _WHITE))

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..blur.edges import has_black_background
 from ..blur.estimation import BlurEstimate, estimate_blur, limit_to_edges
 from ..blur.posterior import BlurPosterior, BlurWitnesses, estimate_posterior
 from ..blur.psf import Float64Array
@@ -217,9 +218,9 @@ def find_blur(
         return estimate_blur(image, exponent=params.exponent, runtime=runtime), posterior
     widest = min(WIDEST, min(grey.shape) / SIGMAS_A_SIDE)
     posterior = replace(posterior, removed=min(posterior.removed, widest))
-    if posterior.removed == 0:
+    # No scene is steeper behind a blur than a step.  Soft limbs need that bound; it takes blurs with wings for narrow.
+    if posterior.removed == 0 or not has_black_background(grey):
         return evidence.estimate, posterior
-    # No scene is steeper behind a blur than a step.
     limited = limit_to_edges(replace(evidence.estimate, sigma=posterior.removed, exponent=posterior.exponent), grey)
     if not limited.edge_limited:
         return evidence.estimate, posterior

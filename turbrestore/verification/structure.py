@@ -33,8 +33,8 @@ from ..core.robust import spread
 from ..registration.warp import inside, warp
 from ..runtime.scratch import drop_pages
 
-# Largest share of unseen edges, where registration leaves more than a share of the variance over the frames; figures in
-# benchmarks/decisions/guards.md.
+# Largest share of unseen edges; share of the variance over the frames above which registration does not explain how
+# they differ; figures in benchmarks/decisions/guards.md.
 UNSEEN, LEFT = 0.03, 0.3
 # Share of what is left that lasts, from which the scene itself changes.  Recorded and simulated clips of scenes that do
 # not change have up to 0.04, textures that live for a tenth of the clip and longer 0.17 and more.
@@ -64,8 +64,8 @@ class StructureReading:
 
     @property
     def explained(self) -> bool:
-        """Whether the frames have the edges of the image, or registration explains how they differ."""
-        return self.left <= LEFT or (self.unseen <= UNSEEN and not self.changes)
+        """Whether the frames have the edges of the image, and the scene stays, or registration explains its changes."""
+        return self.unseen <= UNSEEN and (self.left <= LEFT or not self.changes)
 
     @property
     def changes(self) -> bool:
