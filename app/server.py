@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import secrets
 import socket
@@ -75,6 +76,10 @@ def serve(
 def _serve(
     listener: socket.socket, folders: Folders, file: Path | None, browser: bool, announce: Callable[[str], None]
 ) -> None:
+    from nicegui import binding
+
+    # While all cores work, the library warns that it is late, about which nobody can do anything.
+    binding.MAX_PROPAGATION_TIME = math.inf
     token, port = secrets.token_urlsafe(18), listener.getsockname()[1]
     address = f"http://{HOST}:{port}/{token}/"
     tabs: set[Tab] = set()

@@ -15,8 +15,8 @@ tmt-static (github.com/xg416/TMT: test_TMT_static.py): as atsyn-static, frames J
     input in four windows of 12, which are restored each by itself.
 turbulence-text (DATUM: inferece_DATUM_text.py): ``SEQ/data_0001.png`` … ``data_0100.png``, 440×440.  Frames 21 to 80
     are the input.  The authors recognise the text by networks that are not here: ``--out`` writes
-    ``SEQ/result_0001.png`` for them.  Where a user puts the text into ``SEQ/words.txt``, the share that tesseract reads
-    is printed, which is not the authors' metric.
+    ``SEQ/result_0001.png`` for them.  Where a user puts the text into ``SEQ/words.txt``, the shares that tesseract
+    reads in the result and in the temporal mean are printed, which are not the authors' metric.
 otis (zenodo.org/records/161439): ``Fixed Patterns/PatternN/*.png`` and ``GT/PatternN_GT.png`` below each, known from
     three independent programs that read it, not from the authors.  The truth is aligned with the temporal mean by its
     authors.  PSNR, SSIM; the paper discusses metrics but fixes no protocol that could be verified here.
@@ -198,7 +198,8 @@ def score(sample: Sample, out: Path | None = None) -> Figures:
         if truths:
             found += [{"psnr": psnr(*pair), "ssim": ssim(*pair)} for pair in map(_alike, images, truths)]
         elif sample.words and can_read():
-            found += [{"words": share_read(image, sample.words)} for image in images]
+            shares = share_read(images[0], sample.words), share_read(frames.mean(axis=0), sample.words)
+            found += [dict(zip(("words", "words in the mean"), shares, strict=True))]
         else:
             seen = [appearance(image, frames.mean(axis=0)) for image in images]
             found += [{"sharpness": one.sharpness, "overshoot": one.overshoot} for one in seen]

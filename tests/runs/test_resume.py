@@ -89,7 +89,7 @@ save = run_folder.save_checkpoint
 signal.signal(signal.SIGALRM, lambda *_: None)
 def save_and_wait(*words):
     save(*words)
-    signal.alarm(60)
+    signal.alarm(5)
     signal.pause()
 run_folder.save_checkpoint = save_and_wait
 sys.exit(main(sys.argv[1:]))

@@ -51,7 +51,7 @@ _COSTS: Float64Array = np.geomspace(0.3, 9, 14)
 # Costs of a gradient above this are all the same, and so many gradients make a unit.
 _DEAREST, _GRADIENTS = 20.0, 40.0
 # Decibels by which a wider blur may gain less, and number of factors that are tried.
-_ALIKE, _TRIED = 0.05, 200
+_ALIKE, _TRIED = 0.2, 200
 # Least and largest logarithm of the deviation that a network is trained to say.
 LOG_SPREADS = (-3.0, 1.0)
 # Standardised values beyond this were hardly seen in training.
