@@ -78,7 +78,7 @@ def _serve(
 ) -> None:
     from nicegui import binding
 
-    # While all cores work, the library warns that it is late, about which nobody can do anything.
+    # NiceGUI warns that bindings are slow while all cores work; a user can do nothing about that.
     binding.MAX_PROPAGATION_TIME = math.inf
     token, port = secrets.token_urlsafe(18), listener.getsockname()[1]
     address = f"http://{HOST}:{port}/{token}/"

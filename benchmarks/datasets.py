@@ -198,8 +198,8 @@ def score(sample: Sample, out: Path | None = None) -> Figures:
         if truths:
             found += [{"psnr": psnr(*pair), "ssim": ssim(*pair)} for pair in map(_alike, images, truths)]
         elif sample.words and can_read():
-            shares = share_read(images[0], sample.words), share_read(frames.mean(axis=0), sample.words)
-            found += [dict(zip(("words", "words in the mean"), shares, strict=True))]
+            in_mean = share_read(frames.mean(axis=0), sample.words)
+            found.append({"words": share_read(images[0], sample.words), "words in the mean": in_mean})
         else:
             seen = [appearance(image, frames.mean(axis=0)) for image in images]
             found += [{"sharpness": one.sharpness, "overshoot": one.overshoot} for one in seen]

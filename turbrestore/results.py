@@ -232,7 +232,7 @@ def _checks(restoration: Restoration, motion: float) -> Iterator[Check]:
             yield write_check(decision.check, decision.reason)
     structure, filtered = restoration.structure, restoration.filtered
     if restoration.is_mean:
-        changes = structure is not None and structure.changes
+        changes = structure is not None and structure.unexplained_change
         yield write_check(CheckKind.SCENE_CHANGES if changes else CheckKind.CONTRADICTION)
     if restoration.unseen > _UNSEEN:
         yield write_check(CheckKind.UNSEEN, share_words(restoration.unseen))

@@ -203,8 +203,8 @@ def explain_geometry(filtered: Filtered, dynamics: FlowDynamics) -> Decision:
 
 
 def explain_structure(reading: StructureReading) -> tuple[Decision, ...]:
-    """Say that the filtered image is not the result, if registration does not explain how the frames differ."""
-    if reading.unseen > UNSEEN:
+    """Say why the mean of the frames is the result, or why no blur is removed."""
+    if reading.unseen > UNSEEN and not reading.unexplained_change:
         reason = (
             f"{reading.unseen:.1%} of the edges of the filtered image occur in fewer than half of the frames (bound "
             f"{UNSEEN:.0%})"

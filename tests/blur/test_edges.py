@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from turbrestore.blur.edges import _widest_blur, edge_limit
+from turbrestore.blur.edges import _widest_blur, edge_limit, has_black_background
 from turbrestore.blur.estimation import estimate_blur
 from turbrestore.blur.posterior import BlurWitnesses, blur_posterior
 from turbrestore.blur.psf import GAUSSIAN, blur_otf, fused_exponent
@@ -76,6 +76,12 @@ def test_edges_bound_what_frames_tell_of_a_body_before_black_only(monkeypatch, s
     _, found = find_blur(image, DeconvolutionParams(), DEFAULT, BlurWitnesses(1.0, 40.0))
     assert found.edge_limited == bounded
     assert found.removed == (pytest.approx(1.2, rel=0.25) if bounded else 2.4)
+
+
+@pytest.mark.parametrize("noise", [0.003, 0.01])
+def test_noise_does_not_pass_for_black(noise):
+    assert has_black_background(seen(planet(100), 1.2, noise))
+    assert not has_black_background(seen(0.3 * SCENES["camera"](200, 200) + 0.2, 1.2, noise))
 
 
 @pytest.mark.parametrize("exponent", [GAUSSIAN, fused_exponent(1.5)])

@@ -150,7 +150,7 @@ def learnt_blur(
 
 
 def _widest(gains: Float64Array, most: float) -> float:
-    """Widest factor that gains as much as the best, at most the one given or the best one; 0 if all of them lose."""
+    """Widest factor whose gain falls little short of the best and of none, at most the given or the best; or 0."""
     tried = np.linspace(FACTORS[1], FACTORS[-1], _TRIED)
     found = np.interp(tried, FACTORS, gains)
     most = max(most, float(tried[found.argmax()]))

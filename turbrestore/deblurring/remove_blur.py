@@ -218,7 +218,8 @@ def find_blur(
         return estimate_blur(image, exponent=params.exponent, runtime=runtime), posterior
     widest = min(WIDEST, min(grey.shape) / SIGMAS_A_SIDE)
     posterior = replace(posterior, removed=min(posterior.removed, widest))
-    # No scene is steeper behind a blur than a step.  Soft limbs need that bound; it takes blurs with wings for narrow.
+    # No scene is steeper behind a Gaussian than a step.  A soft limb needs that bound; elsewhere it would take a blur
+    # with wings, whose core is sharp, for a narrow one.
     if posterior.removed == 0 or not has_black_background(grey):
         return evidence.estimate, posterior
     limited = limit_to_edges(replace(evidence.estimate, sigma=posterior.removed, exponent=posterior.exponent), grey)

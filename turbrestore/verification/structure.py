@@ -14,6 +14,10 @@ The share is of edges and not of the frame, so that it does not depend on how mu
 Registration also follows texture that renews itself, such as the granulation of the Sun, and bends the frames until
 they look alike.  Two things tell that.  Registration leaves much of what the frames differ by, noise apart.  And much
 of what it leaves lasts: the beginning and the end of the clip differ by more than independent frames would.
+
+Unseen edges alone make the mean of the frames the result, because registration can explain most differences and still
+bend one row of bricks into the next.  A change of the scene does so only where registration leaves much; otherwise no
+blur is removed.
 """
 
 from __future__ import annotations
@@ -64,8 +68,13 @@ class StructureReading:
 
     @property
     def explained(self) -> bool:
-        """Whether the frames have the edges of the image, and the scene stays, or registration explains its changes."""
-        return self.unseen <= UNSEEN and (self.left <= LEFT or not self.changes)
+        """Whether the filtered image may be the result."""
+        return self.unseen <= UNSEEN and not self.unexplained_change
+
+    @property
+    def unexplained_change(self) -> bool:
+        """Whether the scene itself changes, and registration leaves much of that."""
+        return self.changes and self.left > LEFT
 
     @property
     def changes(self) -> bool:
