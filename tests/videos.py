@@ -1,11 +1,14 @@
 """Video files for tests, made by PyAV alone."""
 
+import tracemalloc
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
 import pytest
+import tifffile
 
 from turbrestore.io.video import open_frames
 
@@ -43,14 +46,55 @@ def grey_ffv1(path, frames=None, **options):
     return encode(path, frames, level="3", slicecrc="1", **options)
 
 
-def refused(path, error, *words, **options):
-    """Opening and reading fails with one line that holds the words; returns the exit code."""
+@contextmanager
+def refusal(error, *words):
+    """What is done here fails with one line that holds the words."""
     with pytest.raises(error) as info:
-        for _ in open_frames(path, **options):
-            pass
+        yield info
     message = str(info.value)
     assert "\n" not in message and all(word in message for word in words), message
+
+
+def refused(path, error, *words, **options):
+    """Opening and reading fails with one line that holds the words; returns the exit code."""
+    with refusal(error, *words) as info:
+        for _ in open_frames(path, **options):
+            pass
     return info.value.exit_code
+
+
+@contextmanager
+def memory_below(limit):
+    """What is done here takes fewer bytes than the limit at any time."""
+    tracemalloc.start()
+    try:
+        yield
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < limit
+
+
+def packets(path):
+    """Place in the file and bytes of every packet."""
+    with av.open(str(path)) as container:
+        return [(packet.pos, bytes(packet)) for packet in container.demux(video=0) if packet.size]
+
+
+def write_pages(path, pages, big=False, **options):
+    """A TIFF file whose pages stand each by itself."""
+    with tifffile.TiffWriter(path, bigtiff=big) as tiff:
+        for page in pages:
+            tiff.write(page, contiguous=False, metadata=None, **options)
+    return path
+
+
+def cuts(path, *shares):
+    """A file with shares of its bytes, one after the other."""
+    data = path.read_bytes()
+    for share in shares:
+        path.write_bytes(data[: int(share * len(data))])
+        yield path
 
 
 def encode_yuv(path, planes):

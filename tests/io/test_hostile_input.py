@@ -2,7 +2,6 @@
 
 import ast
 import os
-import tracemalloc
 import zipfile
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from turbrestore.io.npy import map_npy, read_npz
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video
 from turbrestore_cli.__main__ import main
+from videos import memory_below, packets
 
 ROOT = Path(__file__).parents[2]
 
@@ -150,12 +150,8 @@ class TestArrayFiles:
 
     def test_members_within_each_other_cost_no_memory(self, tmp_path):
         hostile._nested_npz(tmp_path / "a.npz")
-        tracemalloc.start()
-        with pytest.raises(DataError, match="members hold more than"):
+        with memory_below(1e6), pytest.raises(DataError, match="members hold more than"):
             read_npz(tmp_path / "a.npz")
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        assert peak < 1e6
 
     def test_objects_are_not_unpickled(self, tmp_path):
         harmful = b"cbuiltins\nexec\n(S'raise SystemExit(99)'\ntR."
@@ -168,16 +164,12 @@ class TestArrayFiles:
 
 class TestSkippingDamage:
     def test_frames_whose_checksum_fails(self, tmp_path):
-        import av
-
         path = tmp_path / "a.mkv"
         write_video(path, hostile.clip(), 25)
         whole = open_frames(path).read()
-        with av.open(str(path)) as container:
-            packets = [bytes(packet) for packet in container.demux() if packet.size]
         data = bytearray(path.read_bytes())
         for number in (3, 8):
-            data[data.index(packets[number]) + 40] ^= 1
+            data[data.index(packets(path)[number][1]) + 40] ^= 1
         path.write_bytes(data)
         with pytest.raises(DataError, match="frame 3 and 1 more"):
             open_frames(path)
@@ -186,17 +178,6 @@ class TestSkippingDamage:
         np.testing.assert_array_equal(source.read(), np.delete(whole, [3, 8], 0))
         part = open_frames(path, frames=(2, 8), skip_damaged=True)
         np.testing.assert_array_equal(part.read(), whole[[2, 4, 5, 6, 7]])
-
-    @pytest.mark.parametrize("name", ["a.mkv", "a.avi", "a.ser", "a.gif"])
-    def test_a_missing_end(self, tmp_path, name):
-        hostile.write_clip(tmp_path / name)
-        whole = open_frames(tmp_path / name).read()
-        data = (tmp_path / name).read_bytes()
-        (tmp_path / name).write_bytes(data[: int(0.6 * len(data))])
-        source = open_frames(tmp_path / name, skip_damaged=True)
-        assert 2 < len(source) < 12
-        assert source.warnings == (f"cut short after {len(source)} whole frames; the others are missing",)
-        np.testing.assert_array_equal(source.read(), whole[: len(source)])
 
     def test_nothing_whole_is_refused_all_the_same(self, tmp_path):
         hostile.write_clip(tmp_path / "a.ser")
