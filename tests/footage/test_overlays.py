@@ -1,5 +1,7 @@
 """Words over the scene: opaque ones are kept, and those that the scene shows through are named."""
 
+import functools
+
 import cv2
 import numpy as np
 import pytest
@@ -9,17 +11,22 @@ from turbrestore.core.verdict import CheckKind
 from turbrestore.footage.overlays import find_overlay
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
-SIDE, MARGIN = 160, 24
+SIDE, MARGIN, COUNT = 160, 24, 40
+
+
+@functools.cache
+def bent_cups() -> np.ndarray:
+    """Frames of a cup with a margin, which all tests look at."""
+    rng, wide = np.random.default_rng(3), photograph("coffee", SIDE + 2 * MARGIN)
+    flows = smooth_flows(COUNT, *wide.shape, rng, SmoothFlowParams(correlation_length=12))
+    return distort(wide, flows, rng, blur=1.0, noise=0.008)
 
 
 def clip_behind_words(opacity: float, shake: float) -> np.ndarray:
     """Frames of a cup, each moved by whole pixels, behind words that stay in place."""
-    rng = np.random.default_rng(3)
-    wide, count = photograph("coffee", SIDE + 2 * MARGIN), 40
-    shifts = MARGIN + np.clip(np.rint(rng.normal(0, shake, (count, 2))), -MARGIN, MARGIN).astype(int)
-    flows = smooth_flows(count, *wide.shape, rng, SmoothFlowParams(correlation_length=12))
-    bent = distort(wide, flows, rng, blur=1.0, noise=0.008)
-    frames = np.stack([frame[y : y + SIDE, x : x + SIDE] for frame, (x, y) in zip(bent, shifts, strict=True)])
+    moves = np.random.default_rng(3).normal(0, shake, (COUNT, 2))
+    shifts = MARGIN + np.clip(np.rint(moves), -MARGIN, MARGIN).astype(int)
+    frames = np.stack([frame[y : y + SIDE, x : x + SIDE] for frame, (x, y) in zip(bent_cups(), shifts, strict=True)])
     word = np.zeros((SIDE, SIDE), np.uint8)
     cv2.putText(word, "STOCK", (12, 95), cv2.FONT_HERSHEY_SIMPLEX, 1.4, 255, 5)
     cover = opacity * np.float32(word) / 255

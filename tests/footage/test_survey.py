@@ -14,7 +14,7 @@ from turbrestore.pipeline import restore
 from turbrestore.preparation import prepare
 from turbrestore.settings import RestoreParams
 
-RNG = np.random.default_rng(0)
+RNG, COUNT = np.random.default_rng(0), 24
 # Of what a file holds: types that are kept, and one that is not.
 KINDS = {np.uint8: 255, np.uint16: 1023, ">u2": 65535, np.float32: 1, np.uint32: 2**32 - 1}
 
@@ -65,12 +65,12 @@ def test_memory_hardly_grows_with_the_clip():
 
 
 def test_a_clip_is_read_for_the_survey_and_for_the_filter_and_once_more_for_moving_objects():
-    frames = make_sequence(7, 30, 96, "camera", blur=0.8, noise=0.008, rms=1.2).frames.clip(0, 1)
+    frames = make_sequence(7, COUNT, 64, "camera", blur=0.8, noise=0.008, rms=1.2).frames.clip(0, 1)
     walked = 0.8 * frames
     for number, frame in enumerate(walked):
-        frame[40:75, 4 * number : 4 * number + 14] = 0.05
-    flickering = 0.6 * frames * (1 + 0.3 * np.sin(np.arange(30) / 4))[:, None, None]
-    flickering[:, :12] = 0
+        frame[26:50, 3 * number : 3 * number + 9] = 0.05
+    flickering = 0.6 * frames * (1 + 0.3 * np.sin(np.arange(COUNT) / 4))[:, None, None]
+    flickering[:, :8] = 0
     for clip, subjects, times in (
         (frames, set(), 2),
         (flickering, {"bars", "light"}, 2),
@@ -78,7 +78,7 @@ def test_a_clip_is_read_for_the_survey_and_for_the_filter_and_once_more_for_movi
     ):
         source, read = counting(clip.astype(np.float32))
         assert {found.subject for found in prepare(source).decisions} >= subjects
-        assert len(read) == 30 * (times - 1)
+        assert len(read) == COUNT * (times - 1)
         read.clear()
         restore(source, RestoreParams(until="filter"))
-        assert len(read) == 30 * times
+        assert len(read) == COUNT * times

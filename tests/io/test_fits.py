@@ -2,7 +2,6 @@
 
 import gzip
 import importlib.util
-import tracemalloc
 import warnings
 
 import numpy as np
@@ -19,6 +18,7 @@ from turbrestore.io.limits import Limits
 from turbrestore.io.output import check_output
 from turbrestore.io.video import open_frames
 from turbrestore_cli.__main__ import main
+from videos import memory_below, refusal
 
 RNG = np.random.default_rng(4)
 UINT16 = RNG.integers(0, 65536, (5, 6, 7), np.uint16)
@@ -37,25 +37,22 @@ def written(tmp_path):
 
 
 def refused(path, word, error=DataError, **options):
-    with pytest.raises(error) as info:
+    with refusal(error, word):
         open_frames(path, **options)
-    message = str(info.value)
-    assert "\n" not in message and word in message, message
 
 
-@pytest.mark.parametrize("name", ["a.fits", "a.FIT", "a.fts", "a.fits.gz"])
 @pytest.mark.parametrize(
-    "data",
+    ("name", "data"),
     [
-        RNG.integers(0, 256, (5, 6, 7), np.uint8),
-        UINT16,
-        RNG.integers(0, 2**32, (5, 6, 7), np.uint32),
-        RNG.random((5, 6, 7), np.float32),
-        RNG.random((5, 6, 7)),
+        ("a.fits", RNG.integers(0, 256, (5, 6, 7), np.uint8)),
+        *[(name, UINT16) for name in ("a.fits", "a.FIT", "a.fts", "a.fits.gz")],
+        ("a.fits", RNG.integers(0, 2**32, (5, 6, 7), np.uint32)),
+        *[(name, RNG.random((5, 6, 7), np.float32)) for name in ("a.fits", "a.fits.gz")],
+        ("a.fits", RNG.random((5, 6, 7))),
     ],
-    ids=lambda data: str(data.dtype),
+    ids=str,
 )
-def test_a_cube_is_the_array(written, tmp_path, data, name):
+def test_a_cube_is_the_array(written, tmp_path, name, data):
     source = open_frames(written(data, name))
     np.save(tmp_path / "a.npy", data)
     same = open_frames(tmp_path / "a.npy")
@@ -67,19 +64,15 @@ def test_a_cube_is_the_array(written, tmp_path, data, name):
 @pytest.mark.parametrize(
     ("shape", "order"),
     [
-        ((5, 3, 6, 7), (0, 2, 3, 1)),
-        ((3, 5, 6, 7), (1, 2, 3, 0)),
-        ((5, 6, 7, 3), (0, 1, 2, 3)),
-        ((3, 3, 6, 7), (0, 2, 3, 1)),
+        *[((5, 3, 6, 7), (0, 2, 3, 1)), ((3, 5, 6, 7), (1, 2, 3, 0)), ((5, 6, 7, 3), (0, 1, 2, 3))],
+        *[((3, 3, 6, 7), (0, 2, 3, 1)), ((5, 1, 6, 7), (0, 2, 3, 1))],
     ],
 )
-def test_axes_of_colour(written, shape, order):
+def test_axes_of_colour_and_of_a_single_plane(written, shape, order):
     data = RNG.integers(0, 65536, shape, np.uint16)
-    np.testing.assert_array_equal(np.stack(list(open_frames(written(data)).native())), data.transpose(order))
-
-
-def test_a_single_plane_is_grey(written):
-    np.testing.assert_array_equal(list(open_frames(written(UINT16[:, None])).native()), UINT16)
+    expected = data.transpose(order)
+    found = list(open_frames(written(data)).native())
+    np.testing.assert_array_equal(found, expected[..., 0] if 1 in shape else expected)
 
 
 def test_the_first_image_is_found_behind_an_empty_one_and_a_table(tmp_path):
@@ -183,29 +176,24 @@ class TestRefused:
             path.write_bytes(data[:length])
             refused(path, "" if length == 0 else str(path))
 
-    def test_sizes_beyond_the_limits_before_any_data(self, written):
-        for cards in ({"NAXIS1": 10**9}, {"NAXIS3": 10**9}, {"NAXIS1": -4}, {"NAXIS": 999}, {"BITPIX": 12}):
-            path = written(UINT16)
-            data = path.read_bytes()
-            for name, value in cards.items():
-                old = next(
-                    data[place : place + 80]
-                    for place in range(0, 2880, 80)
-                    if data[place : place + 8].strip() == name.encode()
-                )
-                data = data.replace(old, f"{name:<8}= {value:>20}".ljust(80).encode())
-            path.write_bytes(data)
-            refused(path, str(path))
+    @pytest.mark.parametrize(
+        ("key", "value"), [("NAXIS1", 10**9), ("NAXIS3", 10**9), ("NAXIS1", -4), ("NAXIS", 999), ("BITPIX", 12)]
+    )
+    def test_sizes_beyond_the_limits_before_any_data(self, written, key, value):
+        path = written(UINT16)
+        data = path.read_bytes()
+        cards = [data[place : place + 80] for place in range(0, 2880, 80)]
+        old = next(card for card in cards if card[:8].strip() == key.encode())
+        path.write_bytes(data.replace(old, f"{key:<8}= {value:>20}".ljust(80).encode()))
+        refused(path, str(path))
 
     def test_a_compressed_file_that_holds_far_more(self, tmp_path):
         head = fits.PrimaryHDU(np.zeros((50, 90, 90), np.uint8)).header.tostring().encode()
         path = tmp_path / "a.fits.gz"
         for content in (head + bytes(405_000), b"SIMPLE  =".ljust(80) + b" " * 50_000_000):
-            path.write_bytes(gzip.compress(content))
-            tracemalloc.start()
-            refused(path, str(path), limits=SMALL)
-            assert tracemalloc.get_traced_memory()[1] < 20_000_000
-            tracemalloc.stop()
+            path.write_bytes(gzip.compress(content, 1))
+            with memory_below(20_000_000):
+                refused(path, str(path), limits=SMALL)
 
     def test_compressed_tiles(self, tmp_path):
         path = tmp_path / "a.fits.fz"
@@ -256,20 +244,15 @@ class TestWriting:
         np.testing.assert_allclose(found.image, image, atol=0.5 / 255 if depth == 8 else 1e-5)
 
     def test_header_of_the_input_is_kept_where_it_is_true(self, written, tmp_path):
-        source = open_frames(
-            written(
-                UINT16,
-                **{"OBJECT": "Moon", "LONG": 100 * "long ", "CRPIX1": 10.0, "CRPIX2": 4.0, "CRPIX3": 1.0},
-                **{"CTYPE3": "TIME", "DATAMAX": 9, "CHECKSUM": "x"},
-            )
-        )
-        write_fits(
-            tmp_path / "b.fits", np.zeros((3, 3)), 16, header=source.header, history=["σ = 1.2 px"], origin=(2, 1)
-        )
+        kept = {"OBJECT": "Moon", "LONG": 100 * "long ", "CRPIX1": 10.0, "CRPIX2": 4.0}
+        dropped = {"CRPIX3": 1.0, "CTYPE3": "TIME", "DATAMAX": 9, "CHECKSUM": "x"}
+        source = open_frames(written(UINT16, **kept, **dropped))
+        made = {"header": source.header, "history": ["σ = 1.2 px"], "origin": (2, 1)}
+        write_fits(tmp_path / "b.fits", np.zeros((3, 3)), 16, **made)
         header = fits.getheader(tmp_path / "b.fits")
         assert header["OBJECT"] == "Moon" and (header["CRPIX1"], header["CRPIX2"]) == (8, 3)
         assert header["LONG"] == (100 * "long ").rstrip()
-        assert not {"CRPIX3", "CTYPE3", "DATAMAX", "CHECKSUM", "NAXIS3"} & set(header)
+        assert not {*dropped, "NAXIS3"} & set(header)
         assert str(header["HISTORY"]) == "? = 1.2 px"
 
     def test_damaged_cards_do_no_harm(self, tmp_path):
@@ -281,13 +264,13 @@ class TestWriting:
 
 
 def test_restore_gives_the_bytes_of_the_array(sequence, tmp_path, written, capsys):
-    data = np.uint16(np.clip(sequence.frames[:6, :48, :48], 0, 1) * 65535)
+    data = np.uint16(np.clip(sequence.frames[:4, :40, :40], 0, 1) * 65535)
     np.save(tmp_path / "a.npy", data)
     path = written(data, OBJECT="Chart")
     for name in ("a.npy", "a.fits"):
         assert main(["restore", str(tmp_path / name), str(tmp_path / f"{name}.png"), "--quiet", "--threads", "1"]) == 0
     assert (tmp_path / "a.npy.png").read_bytes() == (tmp_path / "a.fits.png").read_bytes()
-    words = ["--frames", "0:6", "--roi", "4,2,40,40", "--quiet", "--threads", "1"]
+    words = ["--frames", "0:4", "--roi", "4,2,32,32", "--quiet", "--threads", "1"]
     assert main(["restore", str(path), str(tmp_path / "b.fits"), *words]) == 0
     with fits.open(tmp_path / "b.fits") as file:
         assert file[0].header["OBJECT"] == "Chart" and file[0].header["BITPIX"] == 16
@@ -306,11 +289,8 @@ def test_flows_stand_behind_the_image_that_they_begin_at(sequence, tmp_path, wri
     flows = np.load(tmp_path / "flows.npy")
     with fits.open(tmp_path / "flows.fits") as file:
         assert [image.name for image in file] == ["PRIMARY", "FLOW"]
-        assert (file[0].header["OBJECT"], file[0].header["CRPIX1"], file["FLOW"].header["BUNIT"]) == (
-            "Chart",
-            6,
-            "pixel",
-        )
+        assert (file[0].header["OBJECT"], file[0].header["CRPIX1"]) == ("Chart", 6)
+        assert file["FLOW"].header["BUNIT"] == "pixel"
         assert "turbrestore flow" in "".join(file[0].header["HISTORY"])
         np.testing.assert_allclose(file[0].data, data[0, 2:42, 4:] / 65535, atol=1e-6)
         assert flows.shape == (3, 40, 60, 2) and np.abs(flows[1]).max() > 0.1
@@ -325,8 +305,9 @@ def mosaic_of(pattern, shape, kind):
     return mosaic
 
 
-@pytest.mark.parametrize("pattern", ["RGGB", "GRBG", "GBRG", "BGGR"])
-@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.uint32, np.float32])
+@pytest.mark.parametrize(
+    ("pattern", "kind"), [("RGGB", np.uint8), ("GRBG", np.uint16), ("GBRG", np.uint32), ("BGGR", np.float32)]
+)
 def test_a_bayer_pattern_in_the_header_gives_colours(written, pattern, kind):
     data = mosaic_of(pattern, (2, 8, 10), kind)
     source = open_frames(written(data, BAYERPAT=pattern), roi=(2, 2, 4, 4))
