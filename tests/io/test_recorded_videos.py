@@ -21,18 +21,6 @@ SHOWN = {
     "mirrored": ((-ONE, 0, 0, ONE), lambda frame: frame[:, ::-1]),
     "transposed": ((0, ONE, ONE, 0), lambda frame: np.swapaxes(frame, 0, 1)),
 }
-CONTAINERS = {
-    ".mts": "libx264",
-    ".m2ts": "mpeg2video",
-    ".ts": "mpeg2video",
-    ".wmv": "wmv2",
-    ".3gp": "mpeg4",
-    ".y4m": "wrapped_avframe",
-    ".mpg": "mpeg1video",
-    ".flv": "flv",
-    ".mxf": "mpeg2video",
-    ".ivf": "libvpx",
-}
 
 
 def with_display_matrix(path, values):
@@ -64,16 +52,6 @@ def test_pixels_that_are_not_square_are_remarked_on(tmp_path):
     path = encode(tmp_path / "a.mp4", scene(), "libx264", "yuv420p", "rgb24", x264_params="sar=16/11")
     (remark,) = open_frames(path).warnings
     assert "16:11" in remark
-
-
-@pytest.mark.parametrize("suffix", CONTAINERS)
-def test_containers_of_cameras(tmp_path, suffix):
-    frames = scene()
-    muxer = {".y4m": "yuv4mpegpipe"}.get(suffix)
-    path = encode(tmp_path / f"a{suffix}", frames, CONTAINERS[suffix], "yuv420p", "rgb24", muxer=muxer)
-    source = open_frames(path)
-    assert source.shape == (12, 48, 64, 3) and source.fps == pytest.approx(30) and source.warnings == ()
-    assert np.abs(255 * source.read() - frames).mean() < 8
 
 
 @pytest.mark.parametrize("name", ["video", "video.tod"])
