@@ -17,7 +17,7 @@ from turbrestore.synthesis.moving_objects import draw_objects
 from turbrestore.synthesis.scenes import SCENES
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
-COUNT, SIDE = 40, 128
+COUNT, SIDE = 32, 112
 
 
 @functools.cache
@@ -63,8 +63,8 @@ def test_the_image_is_that_of_the_clip_without_objects():
 
 def test_a_window_of_a_frame_is_cleaned_as_the_whole_frame_is():
     cleaned, _ = corrected(clip("brick", 3)[0], find_moving_objects)
-    whole, part = cleaned.read(), cleaned.select(roi=(20, 10, 90, 100)).read()
-    assert np.array_equal(whole[:, 10:110, 20:110], part)
+    whole, part = cleaned.read(), cleaned.select(roi=(20, 10, 80, 90)).read()
+    assert np.array_equal(whole[:, 10:100, 20:100], part)
 
 
 @pytest.mark.parametrize("scene", ["chart", "brick"])
@@ -79,31 +79,23 @@ def test_frames_that_are_bent_by_many_pixels_hold_no_moving_objects(scene):
     assert find_moving_objects(surveyed(distort(photograph(scene, 160), moved, rng, blur=1.2, noise=0.01))) is None
 
 
-def test_a_planet_that_drifts_is_the_scene():
+def test_a_planet_that_drifts_and_the_scene_of_a_moving_camera_are_no_moving_objects():
     y, x = np.mgrid[:96, :160]
     frames = np.float32([0.8 * (np.hypot(x - 30 - 4 * k, y - 48) < 20) for k in range(25)])
     frames += 0.05 * (np.random.default_rng(0).random((96, 160)) > 0.998)  # Stars, which the planet covers.
-    assert (
-        find_moving_objects(surveyed(cv2.GaussianBlur(frames.transpose(1, 2, 0), (0, 0), 1.5).transpose(2, 0, 1)))
-        is None
-    )
-
-
-def test_the_scene_is_no_moving_object_while_the_camera_moves():
+    soft = np.stack([cv2.GaussianBlur(frame, (0, 0), 1.5) for frame in frames])
     scene = SCENES["camera"](160, 240)
-    assert find_moving_objects(surveyed(np.stack([scene[:, 4 * k : 4 * k + 140] for k in range(25)]))) is None
+    for some in (soft, np.stack([scene[:, 4 * k : 4 * k + 140] for k in range(25)])):
+        assert find_moving_objects(surveyed(some)) is None
 
 
-def test_a_black_frame_is_left_as_it_is():
+def test_a_black_frame_is_left_as_it_is_and_few_frames_tell_nothing():
     frames, empty = (some.copy() for some in clip("brick", 3))
     frames[[5, 20]] = 0
     cleaned, _ = corrected(frames, find_moving_objects)
     assert not cleaned.read()[[5, 20]].any()
     empty[5] = 0
     assert find_moving_objects(surveyed(empty)) is None
-
-
-def test_few_frames_tell_nothing():
     assert find_moving_objects(surveyed(clip("brick", 3)[0][:8])) is None
 
 
@@ -119,25 +111,19 @@ def snowy(frames, share, seed=3):
 
 
 def test_snow_is_replaced_by_the_background():
-    empty = 0.8 * clip("camera")[1]
+    empty, truth = 0.8 * clip("camera")[1], 0.8 * SCENES["camera"](SIDE, SIDE)
     frames, covers = snowy(empty, 0.06)
     cleaned, found = corrected(frames, find_moving_objects)
     before, after = (np.abs(some - empty)[covers > 0.3].mean() for some in (frames, cleaned.read()))
     assert after < 0.25 * before
     assert "snow" in found.decisions[0].reason
-    found, median = restore(frames).image, np.median(frames, axis=0)
-    assert (
-        compare(found, 0.8 * SCENES["camera"](SIDE, SIDE)).psnr
-        > compare(median, 0.8 * SCENES["camera"](SIDE, SIDE)).psnr + 1
-    )
+    assert compare(restore(frames).image, truth).psnr > compare(np.median(frames, axis=0), truth).psnr + 1
 
 
 def test_a_car_is_replaced_while_the_camera_moves():
     scene, rng = SCENES["camera"](160, 300), np.random.default_rng(2)
-    empty = np.stack([scene[:, 2 * k : 2 * k + 160] for k in range(COUNT)]) + 0.01 * rng.standard_normal(
-        (COUNT, 160, 160)
-    )
-    empty = empty.clip(0, 1).astype(np.float32)
+    empty = np.stack([scene[:, 2 * k : 2 * k + 160] for k in range(COUNT)])
+    empty = (empty + 0.01 * rng.standard_normal(empty.shape)).clip(0, 1).astype(np.float32)
     frames = empty.copy()
     for k, frame in enumerate(frames):
         frame[90:120, 6 * k - 50 : 6 * k] = 0.95 if 50 <= 6 * k <= 160 else frame[90:120, 6 * k - 50 : 6 * k]

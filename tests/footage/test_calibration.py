@@ -114,13 +114,11 @@ def test_darks_of_another_depth_that_may_mean_either_are_refused(case):
     rng = np.random.default_rng(0)
     clip = FrameSource.from_array(np.uint16(rng.integers(200, 3000, (4, *SHAPE))), "clip")
     clip = replace(clip, full_scale=4095, bit_depth=12)
-    dark = np.uint16(rng.integers(0, 200, (5, *SHAPE)))
+    if case == "eight bits":
+        clip = FrameSource.from_array(np.uint8(rng.integers(20, 200, (4, *SHAPE))), "clip")
+    dark = np.uint16(rng.integers(0, 200, (5, *SHAPE)) * (case != "no light"))
     if case == "the mean of darks":
         dark = np.uint16(16 * dark.mean(axis=0, keepdims=True))
-    elif case == "eight bits":
-        clip = FrameSource.from_array(np.uint8(rng.integers(20, 200, (4, *SHAPE))), "clip")
-    else:
-        dark[:] = 0
     with pytest.raises(DataError, match="convert one of the two"):
         make_calibration(clip, FrameSource.from_array(dark, "dark"), None)
 
@@ -133,25 +131,23 @@ def test_a_black_frame_does_not_tell_how_values_are_stored():
     np.testing.assert_allclose(found.dark, OFFSET * 4095 / 65535, atol=1e-5)
 
 
-def test_what_does_not_fit_is_refused():
-    clip = sources()[0]
-    other = FrameSource.from_array(np.zeros((1, 4, 4)), "other")
-    for words, arguments in {
-        "expected 30×24 grey as in clip, found 4×4 grey": (clip, other, None),
-        "expected some frames of values up to 255 as in d, or of those spread over 65535": (
-            clip,
-            FrameSource.from_array(np.zeros((1, *SHAPE), np.uint8), "d"),
+@pytest.mark.parametrize(
+    ("dark", "flat", "words"),
+    [
+        (np.zeros((1, 4, 4)), None, "expected 30×24 grey as in clip, found 4×4 grey"),
+        (
+            np.zeros((1, *SHAPE), np.uint8),
             None,
+            "some frames of values up to 255 as in a, or of those spread over 65535",
         ),
-        "a flat with light": (clip, None, FrameSource.from_array(np.zeros((1, *SHAPE)), "f")),
-        "few hot or dead pixels": (
-            clip,
-            None,
-            FrameSource.from_array(np.tile(np.arange(30) > 9, (1, 24, 1)) * 1.0, "f"),
-        ),
-    }.items():
-        with pytest.raises(DataError, match=words):
-            make_calibration(*arguments)
+        (None, np.zeros((1, *SHAPE)), "a flat with light"),
+        (None, np.tile(np.arange(30) > 9, (1, 24, 1)) * 1.0, "few hot or dead pixels"),
+    ],
+)
+def test_what_does_not_fit_is_refused(dark, flat, words):
+    dark, flat = (array if array is None else FrameSource.from_array(array, "a") for array in (dark, flat))
+    with pytest.raises(DataError, match=words):
+        make_calibration(sources()[0], dark, flat)
 
 
 def test_options_of_the_command_line(tmp_path, monkeypatch, capsys):

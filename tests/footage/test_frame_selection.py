@@ -30,24 +30,18 @@ def test_exactly_the_share_is_kept_and_none_left_out_is_better(quality, share):
     assert kept.all() or values[kept].min() >= values[~kept].max()
 
 
-def test_ties_keep_the_earlier():
-    assert best_frames(np.zeros(10), 0.3).tolist() == [True] * 3 + [False] * 7
-
-
 @pytest.mark.parametrize(("text", "value"), [("30%", 0.3), ("0.3", 0.3), (" 12.5 % ", 0.125), (1, 1.0)])
 def test_shares_are_read(text, value):
     assert Share(text) == pytest.approx(value)
 
 
-@pytest.mark.parametrize("text", ["thirty", "", "%", "30%%"])
-def test_what_is_no_share_is_refused(text):
-    with pytest.raises(ConfigurationError, match="^keep_best: expected a share such as"):
-        Share(text)
-
-
-def test_bad_input_is_refused():
+def test_ties_keep_the_earlier_and_bad_input_is_refused():
+    assert best_frames(np.zeros(10), 0.3).tolist() == [True] * 3 + [False] * 7
     with pytest.raises(DataError, match="expected at least 1"):
         frame_quality([])
     for share in (0, -0.1, 1.1):
         with pytest.raises(ConfigurationError, match="keep_best"):
             best_frames([1.0, 2.0], share)
+    for text in ("thirty", "", "%", "30%%"):
+        with pytest.raises(ConfigurationError, match="^keep_best: expected a share such as"):
+            Share(text)
