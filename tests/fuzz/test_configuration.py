@@ -45,7 +45,7 @@ def called(*words):
 
 
 @given(flat=st.dictionaries(st.sampled_from(KEYS), VALUES, min_size=1, max_size=3))
-@MANY
+@settings(MANY, max_examples=20)
 def test_any_values_of_settings(tmp_path, flat):
     (tmp_path / "a.toml").write_text(tomli_w.dumps(nested(flat)), "utf-8")
     code, err = called("config", "--check", tmp_path / "a.toml")
@@ -54,7 +54,7 @@ def test_any_values_of_settings(tmp_path, flat):
 
 
 @given(data=st.binary(max_size=60))
-@MANY
+@settings(MANY, max_examples=20)
 def test_any_bytes_as_settings(tmp_path, data):
     (tmp_path / "a.toml").write_bytes(data)
     code, err = called("config", "--check", tmp_path / "a.toml")

@@ -10,13 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from turbrestore.core.errors import (
-    ConfigurationError,
-    DataError,
-    InputNotFoundError,
-    OutputError,
-    StorageError,
-)
+from turbrestore.core.errors import ConfigurationError, DataError, InputNotFoundError, OutputError, StorageError
 from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.output import atomic_output, atomic_write, check_output
 from turbrestore.io.pixels import to_unit

@@ -111,6 +111,15 @@ def place(tmp_path, monkeypatch, clip):
     return tmp_path
 
 
+def disk_with(monkeypatch, free):
+    """Have every disk say that it has so many bytes left; the folders that are asked about."""
+    asked, usage = [], namedtuple("usage", "total used free")
+    monkeypatch.setattr(
+        "turbrestore.io.output.shutil.disk_usage", lambda folder: asked.append(folder) or usage(1 << 30, 0, free)
+    )
+    return asked
+
+
 def fails(capsys, words, code, part):
     assert main(words) == code
     err = capsys.readouterr().err
@@ -121,8 +130,7 @@ def fails(capsys, words, code, part):
 
 @pytest.mark.parametrize(("more", "free"), [([], 500_000), (["--keep=kept"], 1_100_000)], ids=["image", "stages"])
 def test_a_disk_that_is_too_full_is_told_before_the_work(place, monkeypatch, capsys, more, free):
-    usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr("turbrestore.io.output.shutil.disk_usage", lambda _: usage(1 << 30, 0, free))
+    disk_with(monkeypatch, free)
     monkeypatch.setattr("turbrestore.pipeline.centroid_steps", None)
     fails(capsys, ["restore", "clip.npy", "o.png", *more, *QUICK], StorageError.exit_code, "make room on the disk")
     assert [path.name for path in place.iterdir()] == ["clip.npy"]
@@ -142,8 +150,7 @@ def test_every_stage_asks_for_room_before_the_work(place, monkeypatch, capsys, w
     assert main(["restore", "clip.npy", "o.png", "--keep=kept", "--sigma=0", *QUICK]) == 0
     for name in ("centroid.npz", "dynamics.npz"):
         (place / "kept" / name).rename(place / name)
-    usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr("turbrestore.io.output.shutil.disk_usage", lambda _: usage(1 << 30, 0, 1 << 20))
+    disk_with(monkeypatch, 1 << 20)
     monkeypatch.setattr(f"turbrestore_cli.{stage}", None)
     before = sorted(place.iterdir())
     fails(capsys, [*words, "--quiet"], StorageError.exit_code, "make room on the disk")
@@ -158,10 +165,7 @@ def test_room_is_asked_for_with_a_margin(tmp_path):
 
 
 def test_room_is_asked_for_in_the_folder_itself_or_that_of_a_file(tmp_path, monkeypatch):
-    asked, usage = [], namedtuple("usage", "total used free")
-    monkeypatch.setattr(
-        "turbrestore.io.output.shutil.disk_usage", lambda folder: asked.append(folder) or usage(0, 0, 0)
-    )
+    asked = disk_with(monkeypatch, 1 << 30)
     for path in (tmp_path, tmp_path / "o.png", tmp_path / "new"):
         check_space(path, 1)
     assert asked == [tmp_path.resolve()] * 3
@@ -211,8 +215,8 @@ def test_no_command_opens_a_socket(place):
     commands = [
         ["synthesize", "chart", "clip.mkv", "--frames=4", "--size=64x64", "--quiet"],
         ["info", "clip.mkv"],
-        ["restore", "clip.mkv", "video.png", "--sigma=1", *QUICK],
-        ["restore", "clip.npy", "o.png", "--keep=kept", "--report=r.html", "--sigma=1", *QUICK],
+        ["info", "clip.npy"],
+        ["restore", "clip.mkv", "o.png", "--keep=kept", "--report=r.html", "--sigma=1", *QUICK],
         ["report", "kept", "--quiet"],
         ["deconvolve", "kept/filtered.npz", "d.png", "--sigma=1", "--deconvolution.iterations=2", "--quiet"],
         ["evaluate", "o.png", "--reference=d.png"],

@@ -43,15 +43,12 @@ class TestArrays:
     @pytest.mark.parametrize(
         ("order", "axes"), [((0, 3, 1, 2), "(T, 3, H, W)"), ((1, 2, 3, 0), "(H, W, 3, T)")], ids=["TCHW", "HWCT"]
     )
-    def test_channels_tell_the_order(self, tmp_path, order, axes):
+    def test_channels_tell_the_order_and_one_is_none(self, tmp_path, order, axes):
         np.save(tmp_path / "a.npy", np.transpose(COLOUR, order))
         source = open_frames(tmp_path / "a.npy")
         np.testing.assert_array_equal(source.read(), COLOUR / np.float32(255))
         assert axes in source.warnings[0]
-
-    @pytest.mark.parametrize("axis", [1, 3])
-    def test_one_channel(self, tmp_path, axis):
-        np.save(tmp_path / "a.npy", np.expand_dims(STILL, axis))
+        np.save(tmp_path / "a.npy", np.expand_dims(STILL, 1 if order[1] == 3 else 3))
         assert open_frames(tmp_path / "a.npy").shape == STILL.shape
 
     @pytest.mark.parametrize("light", ["steady", "bracketed", "stepped", "fading"])
@@ -120,22 +117,17 @@ class TestTiff:
         np.testing.assert_array_equal(np.rint(open_frames(tmp_path / "a.tif").read() * 255), expected)
 
     def test_lzw(self, tmp_path):
-        pages = [PIL.Image.fromarray(frame) for frame in STILL]
-        pages[0].save(tmp_path / "a.tif", save_all=True, append_images=pages[1:], compression="tiff_lzw")
+        write_pages(tmp_path / "a.tif", STILL, compression="lzw")
         np.testing.assert_array_equal(open_frames(tmp_path / "a.tif").read(), STILL / np.float32(255))
 
-    @pytest.mark.parametrize("order", ["<", ">"])
-    @pytest.mark.parametrize("big", [False, True])
-    @pytest.mark.parametrize("first", [False, True])
+    @pytest.mark.parametrize(
+        ("order", "big", "first"), [("<", False, 0), ("<", True, 1), (">", False, 1), (">", True, 0)]
+    )
     def test_pages_of_reduced_size_are_left_out(self, tmp_path, order, big, first):
         with tifffile.TiffWriter(tmp_path / "a.tif", byteorder=order, bigtiff=big) as output:
-            kinds = {"photometric": "minisblack", "contiguous": False, "metadata": None}
-            thumb = STILL[0, ::4, ::4]
-            if first:
-                output.write(thumb, subfiletype=1, **kinds)
-            for frame in STILL:
-                output.write(frame, **kinds)
-            output.write(thumb, subfiletype=1, **kinds)
+            for page in [STILL[0, ::4, ::4]] * first + [*STILL, STILL[0, ::4, ::4]]:
+                options = {"photometric": "minisblack", "contiguous": False, "metadata": None}
+                output.write(page, subfiletype=int(page.shape != STILL.shape[1:]), **options)
         source = open_frames(tmp_path / "a.tif")
         np.testing.assert_array_equal(source.read(), STILL / np.float32(255))
         assert source.warnings == (f"{1 + first} page{'s' * first} of reduced size left out",)

@@ -141,8 +141,7 @@ def test_codecs_and_depths(tmp_path, name, encoding, depth, found):
 
 
 @pytest.mark.parametrize(
-    ("name", "encoding", "message"),
-    [("a.mp4", Encoding("ffv1"), "Matroska"), ("a.npy", Encoding(crf=20), "crf")],
+    ("name", "encoding", "message"), [("a.mp4", Encoding("ffv1"), "Matroska"), ("a.npy", Encoding(crf=20), "crf")]
 )
 def test_codecs_that_do_not_fit_are_refused(tmp_path, name, encoding, message):
     with pytest.raises(ConfigurationError, match=message):
