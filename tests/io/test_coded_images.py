@@ -15,6 +15,7 @@ from turbrestore.io.images.image_files import read_image
 from turbrestore.io.limits import Limits
 from turbrestore.io.pixels import upright
 from turbrestore.io.video import open_frames
+from videos import cuts, refusal
 
 HEIGHT, WIDTH = 32, 48
 
@@ -83,14 +84,12 @@ def test_every_value_comes_back_at_full_range(made, name):
 
 @pytest.mark.parametrize("name", MADE)
 def test_what_is_cut_or_too_large_is_refused(made, tmp_path, name):
-    data = (made / name).read_bytes()
-    for share in (0.02, 0.5, 0.97):
-        (tmp_path / name).write_bytes(data[: int(len(data) * share)])
-        with pytest.raises(DataError, match=name) as refusal:
-            read_image(tmp_path / name)
-        assert "\n" not in str(refusal.value)
-    with pytest.raises(DataError, match=f"{name}: expected up to 1000 pixels, found {WIDTH}×{HEIGHT}"):
+    with refusal(DataError, f"{name}: expected up to 1000 pixels, found {WIDTH}×{HEIGHT}"):
         read_image(made / name, Limits(max_pixels=1000))
+    (tmp_path / name).write_bytes((made / name).read_bytes())
+    for part in cuts(tmp_path / name, 0.02, 0.5, 0.97):
+        with refusal(DataError, name):
+            read_image(part)
 
 
 def test_exr_is_floating_point_and_its_light_may_exceed_white(tmp_path):
