@@ -148,12 +148,15 @@ def _list_pages(path: Path, tiff: tifffile.TiffFile, limits: Limits) -> tuple[in
 
 
 def _check_page(path: Path, page: tifffile.TiffPage, limits: Limits) -> None:
-    """Refuse a page whose tags state too many pixels or too many values per pixel."""
+    """Refuse a page whose tags state too many pixels, too many values per pixel, or values of an unknown type."""
     limits.check_size(page.imagewidth, page.imagelength, str(path))
     if page.is_tiled:
         limits.check_size(page.tilewidth, page.tilelength, f"{path}: a tile")
     if page.samplesperpixel > _MOST_SAMPLES:
         raise DataError(f"{path}: expected up to {_MOST_SAMPLES} values per pixel, found {page.samplesperpixel}")
+    if page.dtype is None:
+        found = f"{page.bitspersample} bits of SampleFormat {int(page.sampleformat)}"
+        raise DataError(f"{path}: expected integers or floating-point numbers, found {found}; convert the file")
 
 
 def _channels(page: tifffile.TiffPage) -> tuple[int, ...] | None:
