@@ -10,6 +10,7 @@ import sys
 import threading
 import tomllib
 from concurrent.futures import Future
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -58,13 +59,8 @@ def scheduler():
 
 
 @pytest.fixture
-def run(capsys, scheduler):
-    def call(*words):
-        code = main(["batch", *map(str, words), "--scheduler", scheduler, *QUICK])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return call
+def run(run, scheduler):
+    return partial(run, "batch", "--scheduler", scheduler, *QUICK)
 
 
 def rows(out):

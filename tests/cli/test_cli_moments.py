@@ -3,20 +3,14 @@
 import json
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 
-from turbrestore_cli.__main__ import main
-
 
 @pytest.fixture
-def run(capsys):
-    def call(*words):
-        code = main(["moments", *map(str, words)])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return call
+def run(run):
+    return partial(run, "moments")
 
 
 class TestWavefront:

@@ -88,46 +88,26 @@ def test_duplicated_and_blank_frames_and_cuts_stay(run, tmp_path):
     assert np.allclose(np.load(tmp_path / "o.npy")[5], two, atol=0.02)
 
 
-def piped(*words, data=b""):
-    command = [sys.executable, "-m", "turbrestore_cli", "steady", *map(str, words)]
-    return subprocess.run(command, input=data, capture_output=True, timeout=120, check=False)
+def stand_in(monkeypatch, data):
+    """Let data come from standard input."""
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(data)))
 
 
-def test_a_pipe_takes_and_gives_raw_frames(tmp_path):
+def test_a_pipe_takes_and_gives_raw_frames():
     scene = np.random.default_rng(0).integers(0, 256, (20, 32, 3), np.uint8)
-    done = piped("-", "-", "--raw", "32x20", "--sigma", "0", "--quiet", data=scene.tobytes() * 4)
+    words = [sys.executable, "-m", "turbrestore_cli", "steady", "-", "-", "--raw=32x20", "--sigma=0", "--quiet"]
+    done = subprocess.run(words, input=scene.tobytes() * 4, capture_output=True, timeout=120, check=False)
     assert (done.returncode, done.stderr) == (0, b"")
     assert np.abs(np.frombuffer(done.stdout, np.uint8).reshape(4, 20, 32, 3) - scene.astype(float)).max() <= 2
 
 
-def test_pipes_of_matroska_stand_in_a_row(tmp_path):
-    first = piped(SAMPLE, "-", *PART, "--sigma", "0", "--quiet")
-    second = piped("-", tmp_path / "o.mkv", "--sigma", "0", "--quiet", data=first.stdout)
-    assert (first.returncode, second.returncode, second.stderr) == (0, 0, b"")
+def test_pipes_of_matroska_stand_in_a_row(tmp_path, monkeypatch, capfdbinary):
+    quick = ["--sigma", "0", "--quiet"]
+    assert main(["steady", str(SAMPLE), "-", *PART, *quick]) == 0
+    stand_in(monkeypatch, capfdbinary.readouterr().out)
+    assert main(["steady", "-", str(tmp_path / "o.mkv"), *quick]) == 0
+    assert capfdbinary.readouterr() == (b"", b"")
     assert open_frames(tmp_path / "o.mkv").shape == (6, 48, 64)
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "part"),
-    [
-        (["-", "o.mkv"], 65, "standard input"),
-        (["-", "o.mkv", "--roi", "0,0,9,9"], 2, "stream"),
-        (["/dev/video99", "o.mkv", "--live"], 65, "/dev/video99: expected a camera"),
-        (["-", "o.mkv", "--raw", "20"], 2, "--raw"),
-        (["-", "-", "--json"], 2, "--json"),
-        (["-", "-", "--crf", "20"], 2, "--crf"),
-        (["-", "-", "--raw", "0x64:gray"], 2, "--raw: expected WIDTHxHEIGHT"),
-        (["-", "-", "--raw", "64x4", "--bit-depth", "16"], 2, "--bit-depth: has no effect"),
-        (["-", "o.mkv", "--report", "o.html"], 2, "--report"),
-    ],
-)
-def test_wrong_words_about_pipes(run, tmp_path, monkeypatch, words, code, part):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"no video")))
-    found, out, err = run("steady", *words)
-    assert (found, out) == (code, "")
-    assert part in err
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_camera_is_recorded_until_it_is_interrupted(run, tmp_path, monkeypatch):
@@ -163,10 +143,10 @@ def test_a_camera_is_recorded_until_it_is_interrupted(run, tmp_path, monkeypatch
     assert np.abs(written.read(2, 3)[0] * 255 - frames).max() <= 2
 
 
-def test_an_empty_pipe_is_named(tmp_path):
-    done = piped("-", "-", "--raw", "32x20", "--sigma", "0")
-    assert (done.returncode, done.stdout) == (65, b"")
-    assert done.stderr == b"turbrestore: standard input: expected at least one frame, found no data\n"
+def test_an_empty_pipe_is_named(run, monkeypatch):
+    stand_in(monkeypatch, b"")
+    told = "turbrestore: standard input: expected at least one frame, found no data\n"
+    assert run("steady", "-", "-", "--raw", "32x20", "--sigma", "0") == (65, "", told)
 
 
 @pytest.mark.long
@@ -181,6 +161,15 @@ def test_a_reader_that_has_seen_enough_is_no_failure():
 @pytest.mark.parametrize(
     ("words", "code", "part"),
     [
+        (["-", "o.mkv"], 65, "standard input"),
+        (["-", "o.mkv", "--roi", "0,0,9,9"], 2, "stream"),
+        (["/dev/video99", "o.mkv", "--live"], 65, "/dev/video99: expected a camera"),
+        (["-", "o.mkv", "--raw", "20"], 2, "--raw"),
+        (["-", "-", "--json"], 2, "--json"),
+        (["-", "-", "--crf", "20"], 2, "--crf"),
+        (["-", "-", "--raw", "0x64:gray"], 2, "--raw: expected WIDTHxHEIGHT"),
+        (["-", "-", "--raw", "64x4", "--bit-depth", "16"], 2, "--bit-depth: has no effect"),
+        (["-", "o.mkv", "--report", "o.html"], 2, "--report"),
         (["none.mkv", "o.mkv"], 66, "none.mkv"),
         ([SAMPLE, "o.jpg"], 2, ".mkv"),
         ([SAMPLE, "o.mkv", "--camera", "still"], 2, "camera"),
@@ -196,8 +185,9 @@ def test_a_reader_that_has_seen_enough_is_no_failure():
 )
 def test_wrong_words_leave_nothing_behind(run, tmp_path, monkeypatch, words, code, part):
     monkeypatch.chdir(tmp_path)
-    found, _, err = run("steady", *words)
-    assert found == code
+    stand_in(monkeypatch, b"no video")
+    found, out, err = run("steady", *words)
+    assert (found, out) == (code, "")
     assert part in err
     assert err.count("\n") == 1
     assert not list(tmp_path.iterdir())

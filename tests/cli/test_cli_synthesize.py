@@ -2,6 +2,7 @@
 
 import json
 from contextlib import nullcontext
+from functools import partial
 
 import cv2
 import numpy as np
@@ -16,7 +17,6 @@ from turbrestore.registration.warp import warp
 from turbrestore.runs.stage_files import load_flows
 from turbrestore.synthesis.atmosphere import fried_parameter
 from turbrestore.synthesis.scenes import resolution_chart
-from turbrestore_cli.__main__ import main
 from turbrestore_cli.progress import TITLES
 
 # Small and cheap to draw.
@@ -24,13 +24,8 @@ QUICK = ["--size", "80x64", "--layers", "2", "--pupil-samples", "24", "--frames"
 
 
 @pytest.fixture
-def run(capsys):
-    def call(*words):
-        code = main(["synthesize", *(str(word) for word in words)])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return call
+def run(run):
+    return partial(run, "synthesize")
 
 
 @pytest.fixture(scope="module")

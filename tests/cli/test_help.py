@@ -40,14 +40,6 @@ def test_all_help_has_every_option_by_stage(run):
     assert "One of centroid, identify, filter, deconvolve." in " ".join(everything.split())
 
 
-@pytest.mark.parametrize("words", COMMANDS)
-def test_help_shows_no_markup_and_no_path_of_the_source(run, words):
-    for flag in ("--help", "--help-all"):
-        code, text, _ = run(*words.split(), flag)
-        assert code == 0
-        assert not re.search(r":\w+:`|``|turbrestore\.\w+\.|\w+Params\b|\bNone\b", text), text
-
-
 def test_the_list_of_commands_has_a_line_for_each(run):
     _, text, _ = run("--help")
     lines = text.split("Commands:")[1].split("Examples:")[0].strip().splitlines()

@@ -17,6 +17,7 @@ from turbrestore.report import render_report
 from turbrestore.runs.run_record import describe_run
 
 EVIL = "<script>alert(1)</script>\"'&.mkv"
+WIDE, NARROW = {"width": 1000, "height": 700}, {"width": 360, "height": 640}
 QUICK = RestoreParams(centroid=CentroidParams(iterations=1))
 
 
@@ -42,6 +43,27 @@ def run(frames):
 @pytest.fixture(scope="session")
 def page(whole, run):
     return render_report(whole, run)
+
+
+@pytest.fixture
+def open_page(browser, report):
+    """Open the report; afterwards nothing must have been complained of, and nothing asked for but the file."""
+    contexts, complaints, requests = [], [], []
+
+    def call(size=WIDE, **options):
+        contexts.append(browser.new_context(viewport=size, **options))
+        page = contexts[-1].new_page()
+        page.on("console", lambda message: complaints.append(message.text))
+        page.on("pageerror", lambda error: complaints.append(str(error)))
+        page.on("request", lambda request: requests.append(request.url))
+        page.goto(report.as_uri())
+        return page
+
+    yield call
+    for context in contexts:
+        context.close()
+    assert complaints == []
+    assert {url for url in requests if not url.startswith("data:")} == {report.as_uri()}
 
 
 class Elements(HTMLParser):

@@ -14,6 +14,8 @@ from turbrestore.report import SteadyFigures, film, steadied, write_steady_repor
 from turbrestore.runs.run_record import describe_run
 from turbrestore_cli.__main__ import main
 
+from .conftest import WIDE
+
 EVIL = "<script>document.title='taken'</script>.mkv"
 COUNT, HEIGHT, WIDTH = 8, 33, 47
 
@@ -87,22 +89,13 @@ def until(page, condition):
 
 
 @pytest.fixture
-def open_page(browser, report):
-    """Open the report; afterwards nothing must have been complained of."""
-    contexts, complaints = [], []
-
-    def call(width=1280, height=860, **options):
-        contexts.append(browser.new_context(viewport={"width": width, "height": height}, **options))
-        page = contexts[-1].new_page()
-        page.on("console", lambda message: complaints.append(message.text))
-        page.goto(report.as_uri())
+def open_film(open_page):
+    def call(size=WIDE, **options):
+        page = open_page(size, **options)
         until(page, "film.readyState >= 2 || film.error !== null")
         return page
 
-    yield call
-    for context in contexts:
-        context.close()
-    assert complaints == []
+    return call
 
 
 def levels(page, key):
@@ -112,8 +105,8 @@ def levels(page, key):
     return cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)[:HEIGHT, :WIDTH].astype(float)
 
 
-def test_film_shows_two_panels_of_one_frame(open_page):
-    page = open_page()
+def test_film_shows_two_panels_of_one_frame(open_film):
+    page = open_film()
     assert page.evaluate("[film.videoWidth, film.videoHeight]") == [2 * (WIDTH + 1), 2 * (HEIGHT + 1)]
     assert page.evaluate("film.duration") == pytest.approx(COUNT / 25)
     shown = page.locator("#frame-shown")
@@ -138,8 +131,8 @@ def test_film_shows_two_panels_of_one_frame(open_page):
     assert 0 < moving[:, -8:].mean() < 0.5 * levels(page, "output")[:, -8:].mean()
 
 
-def test_film_plays_and_loops(open_page):
-    page = open_page()
+def test_film_plays_and_loops(open_film):
+    page = open_film()
     page.locator("#stage").focus()
     page.evaluate("film.addEventListener('seeked', () => { window.looped = true; }); 0")
     page.keyboard.press(" ")
@@ -151,8 +144,8 @@ def test_film_plays_and_loops(open_page):
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 860)])
-def test_figures_and_film_are_within_the_window(open_page, width, height, scheme):
-    page = open_page(width, height, color_scheme=scheme)
+def test_figures_and_film_are_within_the_window(open_film, width, height, scheme):
+    page = open_film({"width": width, "height": height}, color_scheme=scheme)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     boxes = [element.bounding_box() for element in page.locator(".headline > div").all()]
     # No figure stands alone in the last row.
@@ -161,13 +154,10 @@ def test_figures_and_film_are_within_the_window(open_page, width, height, scheme
     assert player["height"] < height
 
 
-def test_without_scripts_the_film_has_its_own_controls(browser, report):
-    context = browser.new_context(java_script_enabled=False)
-    page = context.new_page()
-    page.goto(report.as_uri())
+def test_without_scripts_the_film_has_its_own_controls(open_page):
+    page = open_page(java_script_enabled=False)
     assert page.locator("#film").is_visible()
     assert not page.locator("#stage").is_visible()
-    context.close()
 
 
 def test_command_writes_the_page(tmp_path):

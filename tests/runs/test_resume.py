@@ -58,25 +58,18 @@ def test_what_is_done_is_not_done_again(place, monkeypatch):
     assert blocks == [0, 8, 4]
 
 
-def test_the_record_names_the_outputs_only_while_they_are_written(place):
+def test_the_record_names_outputs_while_they_are_written_and_a_run_that_dies_twice_replaces_them(place):
     with pytest.MonkeyPatch.context() as patch:
         interrupt(patch, "turbrestore_cli.clip.write_settings", 1)
         assert main(WORDS) == 130
     names = {Path(name).name for name in read_stages("kept").outputs}
     assert names == {"sharp.png", "sharp.png.toml"}
-    assert main([*WORDS, "--resume"]) == 0
-    assert read_stages("kept").outputs == ()
-
-
-def test_a_run_that_dies_twice_may_still_replace_its_own_outputs(place):
-    with pytest.MonkeyPatch.context() as patch:
-        interrupt(patch, "turbrestore_cli.clip.write_settings", 1)
-        assert main(WORDS) == 130
     assert (place / "sharp.png").exists()
     with pytest.MonkeyPatch.context() as patch:
         interrupt(patch, "turbrestore.pipeline._find_crop", 1)
         assert main([*WORDS, "--resume"]) == 130
     assert main([*WORDS, "--resume"]) == 0
+    assert read_stages("kept").outputs == ()
 
 
 # The run waits for a signal after a checkpoint, so that it does not come too late on a fast machine.  It may come

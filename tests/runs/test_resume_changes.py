@@ -107,17 +107,26 @@ def test_a_changed_input_starts_again_and_a_touched_one_does_not(ended, monkeypa
 
 
 @pytest.mark.parametrize(
-    ("name", "change"),
-    [("centroid.npz", "cut"), ("filtered.npz", "lost"), ("mean.npy", "other"), ("blur.npz", "lost")],
+    ("name", "change", "said"),
+    [
+        ("centroid.npz", "cut", "from the start"),
+        ("filtered.npz", "lost", "after the flow model"),
+        ("deconvolution.npz", "lost", "after the filter"),
+        ("mean.npy", "other", "after the deconvolution"),
+        ("blur.npz", "lost", "after the filter"),
+    ],
 )
-def test_files_that_are_not_what_was_written_are_made_again(whole, ended, capsys, name, change):
+def test_files_that_are_not_what_was_written_are_made_again(whole, ended, capsys, name, change, said):
     path = ended / "kept" / name
     data = path.read_bytes()
     path.unlink()
     if change != "lost":
         path.write_bytes(data[: len(data) // 2] if change == "cut" else data.replace(b"\x00", b"\x01", 1))
     assert main([*WORDS, "--resume", "--overwrite"]) == 0
-    assert f"{name} is missing or damaged and is made again" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert f"{name} is missing or damaged and is made again" in err
+    # What is said ends at the first gap.
+    assert f"continues {said}" in err and err.count("continues") == 1
     assert contents(ended) == contents(whole)
 
 

@@ -26,13 +26,6 @@ class TestFolder:
         assert main([*words, "--overwrite"]) == 0
         assert called == list(STAGES)
 
-    def test_a_folder_with_something_else_is_refused(self, place, capsys):
-        (place / "kept").mkdir()
-        (place / "kept" / "letter.txt").write_text("dear")
-        assert main([*WORDS, "--resume"]) == OutputError.exit_code
-        assert "holds no run to go on with" in capsys.readouterr().err
-        assert [path.name for path in (place / "kept").iterdir()] == ["letter.txt"]
-
     def test_resume_needs_a_folder_and_checkpoints_a_distance(self, place, capsys):
         assert main(["restore", "clip.mkv", "o.png", "--resume"]) == ConfigurationError.exit_code
         assert main([word.replace("every=8", "every=0") for word in WORDS]) == ConfigurationError.exit_code
