@@ -113,7 +113,7 @@ def test_a_changed_input_starts_again_and_a_touched_one_does_not(ended, monkeypa
         ("filtered.npz", "lost", "after the flow model"),
         ("deconvolution.npz", "lost", "after the filter"),
         ("mean.npy", "other", "after the deconvolution"),
-        ("blur.npz", "lost", "after the filter"),
+        ("blur.npz", "lost", "after the deconvolution"),
     ],
 )
 def test_files_that_are_not_what_was_written_are_made_again(whole, ended, capsys, name, change, said):
