@@ -70,10 +70,10 @@ class TestHelp:
             code, out, _ = run(*words.split(), flag)
             assert code == 0
             assert not re.search(r":\w+:`|``|turbrestore\.\w+\.|\w+Params\b|\bNone\b", out), out
-            shown = " ".join(out.split("Examples:")[1].split())
-            for name in (words,) if words in EXAMPLES else ("moments wavefront", "moments mirror"):
-                for example in EXAMPLES[name]:
-                    assert " ".join(example.split()) in shown
+        shown = " ".join(out.split("Examples:")[1].split())
+        for name in (words,) if words in EXAMPLES else ("moments wavefront", "moments mirror"):
+            for example in EXAMPLES[name]:
+                assert " ".join(example.split()) in shown
 
     def test_no_command_is_without(self):
         assert set(COMMANDS) == set(EXAMPLES)
