@@ -16,6 +16,7 @@ from conftest import make_sequence
 from turbrestore import pipeline
 from turbrestore.core.errors import StorageError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+from turbrestore.filtering.filter_records import FilterParams
 from turbrestore.io.source import FrameSource
 from turbrestore.memory_plan import plan_memory
 from turbrestore.registration.centroid import CentroidParams
@@ -27,9 +28,7 @@ from turbrestore_cli.__main__ import main
 from turbrestore_cli.inputs import read_input_image
 
 QUICK = RestoreParams(
-    train=16,
-    centroid=CentroidParams(iterations=2),
-    deconvolution=DeconvolutionParams(sigma=1.0, iterations=5),
+    train=16, centroid=CentroidParams(iterations=2), deconvolution=DeconvolutionParams(sigma=1.0, iterations=5)
 )
 TWO = Runtime(threads=2)
 
@@ -207,16 +206,16 @@ def test_a_kept_run_continues_with_another_limit(frames, limited, tmp_path, monk
 
 @pytest.mark.long
 def test_a_limited_run_interrupted_in_the_filter_ends_the_same(tmp_path):
-    frames = make_sequence(seed=52, count=48, size=64, blur=1.0).frames
-    source = FrameSource.from_array(frames)
+    frames = make_sequence(seed=52, count=32, size=64, blur=1.0).frames
+    source, params = FrameSource.from_array(frames), replace(QUICK, filter=FilterParams(block=8))
     (scratch := tmp_path / "scratch").mkdir()
-    runtime = replace(TWO, memory_limit=limit_that(frames.shape, in_scratch), scratch=scratch)
-    whole = pipeline.restore(source, QUICK, runtime)
+    runtime = replace(TWO, memory_limit=limit_that(frames.shape, in_scratch, params), scratch=scratch)
+    whole = pipeline.restore(source, params, runtime)
     assert isinstance(whole.centroid.flows, np.memmap)
     # After the frames of the training, and between two blocks of those behind them.
-    for records in (16, 40):
+    for records in (16, 24):
         (folder := tmp_path / f"kept{records}").mkdir()
-        kept = RunFolder(folder, source, QUICK, runtime, checkpoint_every=1)
+        kept = RunFolder(folder, source, params, runtime, checkpoint_every=1)
         taken = kept.checkpoint
 
         def checkpoint(state, taken=taken, records=records):
@@ -226,11 +225,11 @@ def test_a_limited_run_interrupted_in_the_filter_ends_the_same(tmp_path):
 
         kept.checkpoint = checkpoint
         with pytest.raises(KeyboardInterrupt):
-            pipeline.restore(source, QUICK, runtime, kept)
+            pipeline.restore(source, params, runtime, kept)
         assert not list(scratch.iterdir())
-        later = RunFolder(folder, source, QUICK, runtime, resume=True)
+        later = RunFolder(folder, source, params, runtime, resume=True)
         assert len(later.filter_start().records) == records
-        resumed = pipeline.restore(source, QUICK, runtime, later)
+        resumed = pipeline.restore(source, params, runtime, later)
         for name in ("image", "variance", "shares", "flow_states"):
             assert np.array_equal(getattr(resumed.filtered, name), getattr(whole.filtered, name))
         assert np.array_equal(resumed.image, whole.image)

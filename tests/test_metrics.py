@@ -3,27 +3,13 @@ import numpy as np
 import pytest
 
 from turbrestore.core.errors import DataError
-from turbrestore.metrics import (
-    align,
-    appearance,
-    compare,
-    compare_flows,
-    endpoint_error,
-    overshoot,
-    psnr,
-    sharpness,
-)
+from turbrestore.metrics import align, appearance, compare, compare_flows, endpoint_error, overshoot, psnr, sharpness
 from turbrestore.synthesis.scenes import resolution_chart
 
 
 @pytest.fixture(scope="module")
 def scene():
     return cv2.GaussianBlur(resolution_chart(160, 192), (0, 0), 1.6)
-
-
-def test_psnr_of_known_noise(scene):
-    noisy = scene + np.random.default_rng(0).normal(0, 0.05, scene.shape).astype(np.float32)
-    assert compare(noisy, scene).psnr == pytest.approx(-20 * np.log10(0.05), abs=0.1)
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (1.4, -0.7), (-2.3, 0.2), (9.0, -6.5)])
@@ -34,29 +20,11 @@ def test_a_global_shift_costs_next_to_nothing(scene, shift):
     assert compare(moved, scene).psnr > 30
 
 
-def test_a_crop_is_found(scene):
-    assert compare(scene[5:-9, 12:-3], scene).psnr > 60
-
-
 def test_gain_and_offset_are_fitted(scene):
     figures = compare(0.7 * scene + 0.1, scene)
     assert figures.psnr < 25
     assert figures.psnr_fit > 60
     assert figures.ssim > 0.999
-
-
-def test_aligned_images_are_the_interior(scene):
-    result, truth = align(scene, scene)
-    assert result.shape == truth.shape == (100, 132)
-    assert (truth == scene[30:-30, 30:-30]).all()
-
-
-def test_sharpness_and_overshoot(scene):
-    blurred = cv2.GaussianBlur(scene, (0, 0), 2)
-    assert sharpness(blurred, scene) < 0.8
-    unsharp = scene + 2 * (scene - blurred)
-    assert overshoot(unsharp, scene) > 0.05
-    assert overshoot(blurred, scene) == 0
 
 
 def test_a_shift_is_taken_out_exactly_once():

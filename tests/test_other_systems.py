@@ -17,6 +17,7 @@ import pytest
 from turbrestore.core.errors import OutputError, StorageError
 from turbrestore.io.output import atomic_output, atomic_write
 from turbrestore.io.video import open_frames
+from turbrestore.registration.centroid import CentroidParams
 from turbrestore.runs.folder_lock import LOCK, lock_folder
 from turbrestore.runtime.scratch import drop_pages, new_stack
 from turbrestore.runtime.threads import available_cores
@@ -123,14 +124,9 @@ sys.exit(main(sys.argv[1:]))
 
 
 def test_a_run_without_posix_on_a_console_without_utf_8(clip, tmp_path):
-    words = [
-        "restore",
-        str(clip),
-        str(tmp_path / "sharp.png"),
-        "--keep",
-        str(tmp_path / "kept"),
-        "--memory-limit=400MB",
-    ]
+    words = ["restore", str(clip), str(tmp_path / "sharp.png"), "--keep", str(tmp_path / "kept"), "--sigma=1"]
+    words += ["--memory-limit=400MB", "--centroid.iterations=1", "--filter.inner-iterations=1"]
+    words += ["--deconvolution.iterations=2"]
     environment = {**os.environ, "PYTHONIOENCODING": "cp1252", "PYTHONUTF8": "0", "LC_ALL": "C"}
     done = subprocess.run(
         [sys.executable, "-c", PRELUDE, *words, "--verbose"], capture_output=True, check=False, env=environment
@@ -142,7 +138,7 @@ def test_a_run_without_posix_on_a_console_without_utf_8(clip, tmp_path):
 
 
 def test_a_clip_is_restored_in_a_process_that_is_spawned(clip, tmp_path):
-    settings = RestoreParams(until="centroid")
+    settings = RestoreParams(until="centroid", centroid=CentroidParams(iterations=1))
     order = Order(clip, tmp_path / "a.png", Selection(), settings, Machine(threads=1))
     assert pickle.loads(pickle.dumps(order)) == order
     with multiprocessing.get_context("spawn").Pool(1) as pool:

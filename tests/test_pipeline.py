@@ -81,19 +81,6 @@ def test_a_source_is_read_front_to_back_and_once_for_all_stages(blurred):
     assert reads == [*range(8), *range(8)]
 
 
-def test_the_result_is_the_same_every_time(blurred):
-    first, second = (restore(blurred.frames[:6], QUICK).image for _ in range(2))
-    assert (first == second).all()
-
-
-@pytest.mark.parametrize("count", [2, 3, 5])
-def test_few_frames_still_give_an_image(count):
-    frames = make_sequence(seed=12, count=count, size=64, rms=0.5).frames
-    image = restore(frames).image
-    assert image.shape == (64, 64)
-    assert np.isfinite(image).all()
-
-
 def test_colour_gives_colour(blurred):
     tint = np.array([1.0, 0.8, 0.5], np.float32)
     image = restore(blurred.frames[:5, ..., None] * tint, QUICK).image
@@ -116,7 +103,7 @@ def test_paper_settings_run(blurred):
         centroid=CentroidParams(mode="single", iterations=2),
         filter=FilterParams(residual="drop", sharpness=0, block=1, prior_frames=10),
     )
-    assert np.isfinite(restore(blurred.frames, params).image).all()
+    assert np.isfinite(restore(blurred.frames[:16, :64, :64], params).image).all()
 
 
 def test_progress_reaches_every_stage(blurred):
@@ -188,9 +175,8 @@ def test_a_cropped_border_is_what_the_frames_show(blurred):
     assert cropped.decisions[-1].choice == f"cropped to {width}×{height} pixels from ({x}, {y})"
 
 
-def test_every_stage_says_what_it_decided(blurred):
-    params = replace(QUICK, train=14, deconvolution=DeconvolutionParams(sigma=1.1))
-    subjects = [decision.subject for decision in restore(blurred.frames, params).decisions]
+def test_every_stage_says_what_it_decided(restoration):
+    subjects = [decision.subject for decision in restoration.decisions]
     stages = ["training", "centroid", "displacement", "flow model", "frames", "geometry", "blur", "guards", "border"]
     assert list(dict.fromkeys(subjects)) == stages
 

@@ -1,7 +1,6 @@
 """The public functions of the stages, called one after the other, give what ``restore`` gives."""
 
 import numpy as np
-import pytest
 
 import turbrestore as tr
 from conftest import make_sequence
@@ -22,11 +21,6 @@ def test_stages_by_hand_give_the_image_of_restore():
     guide = tr.recentre(centroid.image, filtered.mean_flow)
     sharp = tr.deconvolve(straight.image, 1.0, known.deconvolution, guide, noise=whole.noise)
     np.testing.assert_array_equal(sharp.image, whole.image)
-
-
-def test_a_path_in_place_of_frames_names_the_function_that_opens_it():
-    with pytest.raises(tr.TurbrestoreError, match=r"the path clip\.mkv; open it with turbrestore\.open_frames"):
-        tr.restore("clip.mkv")
 
 
 def test_dynamics_are_printed_in_a_few_lines():

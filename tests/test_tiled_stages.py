@@ -25,26 +25,22 @@ from turbrestore.runtime.tiling import cut_tile, halo_tiles
 from turbrestore.settings import RestoreParams
 from turbrestore.tiles import join_centroids, join_filtered
 
-HALO = 24
-TILES = halo_tiles((128, 128), 112, HALO)
+HALO = 16
+TILES = halo_tiles((96, 96), 80, HALO)
 
 
 @pytest.fixture(scope="module")
 def sequence():
-    return make_sequence(seed=61, count=12, size=128, blur=1.2)
+    return make_sequence(seed=61, count=12, size=96, blur=1.2)
 
 
 @pytest.fixture(scope="module")
-def blurred(sequence):
-    return find_centroid(sequence.frames).image
+def whole(sequence):
+    return find_centroid(sequence.frames)
 
 
-def test_there_are_four_tiles():
+def test_a_centroid_in_tiles_is_as_good_as_that_of_the_whole(sequence, whole, tmp_path):
     assert len(TILES) == 4
-
-
-def test_a_centroid_in_tiles_is_as_good_as_that_of_the_whole(sequence, tmp_path):
-    whole = find_centroid(sequence.frames)
     parts = (find_centroid(cut_tile(sequence.frames, tile)) for tile in TILES)
     tiled = join_centroids(parts, TILES, sequence.frames.shape, tmp_path)
     assert isinstance(tiled.flows, np.memmap) and isinstance(tiled.image, np.memmap)
@@ -55,9 +51,8 @@ def test_a_centroid_in_tiles_is_as_good_as_that_of_the_whole(sequence, tmp_path)
     assert tiled.converged == whole.converged
 
 
-def test_one_tile_is_the_whole(sequence, blurred):
-    tiles = halo_tiles((128, 128), 128, HALO)
-    whole = find_centroid(sequence.frames)
+def test_one_tile_is_the_whole(sequence, whole):
+    tiles = halo_tiles((96, 96), 96, HALO)
     tiled = join_centroids([whole], tiles, sequence.frames.shape)
     for name in ("image", "flows", "mean_flow_sizes"):
         assert np.array_equal(getattr(whole, name), getattr(tiled, name))
@@ -99,7 +94,7 @@ def divide(patch, scratch):
 
     def plan(shape, params, runtime):
         found = plan_memory(shape, params, runtime)
-        return replace(found, runtime=replace(found.runtime, scratch=scratch), tile=112)
+        return replace(found, runtime=replace(found.runtime, scratch=scratch), tile=80)
 
     for module in (pipeline, run_folder_module):
         patch.setattr(module, "plan_memory", plan)
@@ -159,8 +154,22 @@ def test_a_restoration_in_tiles_is_the_same_bytes_whatever_the_number_of_threads
             for name in names
         ]
 
-    for threads in (2, 5):
-        assert contents(pipeline.restore(sequence.frames, QUICK, Runtime(threads=threads))) == contents(tiled)
+    assert contents(pipeline.restore(sequence.frames, QUICK, Runtime(threads=5))) == contents(tiled)
+
+
+def interrupt(source, folder, finished, monkeypatch):
+    """Keep a restoration that ends once the filter has finished so many tiles."""
+    kept, real = RunFolder(folder, source, QUICK), tiles_module._filter_tile
+
+    def interrupted(run, centroid, training, counted, number):
+        if number == finished:
+            raise KeyboardInterrupt
+        return real(run, centroid, training, counted, number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tiles_module, "_filter_tile", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            pipeline.restore(source, QUICK, store=kept)
 
 
 def elsewhere(function, tasks):
@@ -184,6 +193,10 @@ def test_tiles_are_the_same_bytes_wherever_they_are_worked_on(sequence, tiled, k
         assert np.array_equal(getattr(here.filtered, name), getattr(there.filtered, name))
     for stage in ("centroid", "filter"):
         assert [step for step in told if step[0] == stage] == [(stage, done, 4) for done in (1, 2, 3, 4)]
+    # Frames that do not count do not in any tile.
+    assert np.count_nonzero(here.filtered.shares) == 12 * keep_best
+    assert np.isnan(here.filtered.sharpness).sum() == 12 * (1 - keep_best)
+    assert np.isfinite(here.image).all()
 
 
 @pytest.mark.usefixtures("in_tiles")
@@ -221,31 +234,13 @@ def test_tiles_may_be_asked_for():
         Runtime(tile=200)
 
 
-@pytest.mark.usefixtures("in_tiles")
-def test_frames_that_do_not_count_do_not_in_any_tile(sequence):
-    restored = pipeline.restore(sequence.frames, replace(QUICK, keep_best=0.5))
-    assert np.count_nonzero(restored.filtered.shares) == 6
-    assert np.isnan(restored.filtered.sharpness).sum() == 6
-    assert np.isfinite(restored.image).all()
-
-
 @pytest.mark.long
 @pytest.mark.usefixtures("in_tiles")
 @pytest.mark.parametrize("finished", [1, 3])
 def test_a_run_in_tiles_that_is_interrupted_ends_the_same(sequence, tiled, tmp_path, monkeypatch, finished):
     source = FrameSource.from_array(sequence.frames)
     (folder := tmp_path / "kept").mkdir()
-    kept, real = RunFolder(folder, source, QUICK), tiles_module._filter_tile
-
-    def interrupted(run, centroid, training, counted, number):
-        if number == finished:
-            raise KeyboardInterrupt
-        return real(run, centroid, training, counted, number)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(tiles_module, "_filter_tile", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            pipeline.restore(source, QUICK, store=kept)
+    interrupt(source, folder, finished, monkeypatch)
     later = RunFolder(folder, source, QUICK, resume=True)
     assert later.notes == (f"continues after the flow model and {finished} tile{'s' * (finished > 1)} of the filter",)
     told = []
@@ -261,18 +256,9 @@ def test_a_run_in_tiles_that_is_interrupted_ends_the_same(sequence, tiled, tmp_p
 
 @pytest.mark.usefixtures("in_tiles")
 def test_a_damaged_tile_is_filtered_again(sequence, tmp_path, monkeypatch):
-    source, real = FrameSource.from_array(sequence.frames), tiles_module._filter_tile
+    source = FrameSource.from_array(sequence.frames)
     (folder := tmp_path / "kept").mkdir()
-
-    def interrupted(run, centroid, training, counted, number):
-        if number == 2:
-            raise KeyboardInterrupt
-        return real(run, centroid, training, counted, number)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(tiles_module, "_filter_tile", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            pipeline.restore(source, QUICK, store=RunFolder(folder, source, QUICK))
+    interrupt(source, folder, 2, monkeypatch)
     damaged = folder / "filtered_tile_0.npz"
     damaged.write_bytes(damaged.read_bytes()[:-40])
     notes = RunFolder(folder, source, QUICK, resume=True).notes

@@ -129,9 +129,6 @@ class TestBasis:
             image_moments(image, PIXELS, 4, "legendre"), change @ image_moments(image, PIXELS, 4)
         )
 
-    def test_second_legendre_moment_is_the_second_minus_a_third_of_order_0(self):
-        np.testing.assert_allclose(basis_change(PIXELS, 2, "legendre")[2], [-1 / 3, 0, 1], atol=1e-12)
-
     def test_unknown_basis(self):
         with pytest.raises(ConfigurationError, match="monomial, legendre"):
             image_moments(np.ones(400), PIXELS, 2, "fourier")

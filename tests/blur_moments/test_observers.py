@@ -181,22 +181,20 @@ class TestErrata:
 
 
 class TestRefusals:
-    @pytest.mark.parametrize("observer", [KALMAN, MomentFilter(), ImageFilter()])
-    @pytest.mark.parametrize("frame", [np.zeros(99), np.full(100, np.nan)])
-    def test_frames(self, observer, frame):
-        with pytest.raises(DataError, match="^(image|frame): expected [^\n]*$"):
-            observer.step(MODEL, START, frame, np.zeros(200))
-
-    @pytest.mark.parametrize("observer", [KALMAN, MomentFilter(), ImageFilter()])
-    def test_inputs(self, observer):
-        with pytest.raises(DataError, match="^input: expected [^\n]*$"):
-            observer.step(MODEL, START, np.zeros(100), np.zeros(199))
-
     @pytest.mark.parametrize("observer", [KALMAN, MomentFilter(), MomentFilter(method="unscented"), ImageFilter()])
-    def test_states_of_another_system(self, observer):
-        # Reshaped, four numbers would pass for two states of two.
-        with pytest.raises(DataError, match="^state: expected [^\n]*$"):
-            observer.step(MODEL, Gaussian(np.zeros(4), np.eye(4)), np.zeros(100), np.zeros(200))
+    @pytest.mark.parametrize(
+        ("state", "frame", "inputs", "named"),
+        [
+            (START, np.zeros(99), np.zeros(200), "(image|frame)"),
+            (START, np.full(100, np.nan), np.zeros(200), "(image|frame)"),
+            (START, np.zeros(100), np.zeros(199), "input"),
+            # Reshaped, four numbers would pass for two states of two.
+            (Gaussian(np.zeros(4), np.eye(4)), np.zeros(100), np.zeros(200), "state"),
+        ],
+    )
+    def test_frames_inputs_and_states_of_another_system(self, observer, state, frame, inputs, named):
+        with pytest.raises(DataError, match=f"^{named}: expected [^\n]*$"):
+            observer.step(MODEL, state, frame, inputs)
 
     def test_gain_of_another_system(self):
         with pytest.raises(ConfigurationError, match="^gain: expected [^\n]*$"):
@@ -214,17 +212,17 @@ class TestRefusals:
             singular = Gaussian(np.zeros(2), np.diag([1.0, 0.0]))
             MomentFilter(method="unscented").step(MODEL, singular, np.zeros(100), np.zeros(200))
 
-    @pytest.mark.parametrize("Q", [np.diag([1.0, -1.0]), np.array([[0.0, 1.0], [0.0, 0.0]])])
-    def test_disturbance_that_is_no_covariance(self, Q):
-        motion = lift(
-            FastSystem([[0.9, 0.1], [0.0, 0.5]], [0.0, 1.0], [1.0, 0.0]), ExposureTiming(1.0, 1.0, 0.0, 1.0), Q
-        )
-        with pytest.raises(DataError, match="^Q: expected a [^\n]*$"):
-            steady_kalman(BlurModel(motion, MODEL.sensor))
-
-    def test_filter_that_never_settles(self):
-        motion = lift(FastSystem([[1.0]], [1.0], [1.0]), ExposureTiming(1.0, 1.0, 0.0, 1.0), [[0.0]])
-        with pytest.raises(DataError, match="^Q: expected [^\n]*settles"):
+    @pytest.mark.parametrize(
+        ("system", "Q", "words"),
+        [
+            (([[0.9, 0.1], [0.0, 0.5]], [0.0, 1.0], [1.0, 0.0]), np.diag([1.0, -1.0]), "a [^\n]*"),
+            (([[0.9, 0.1], [0.0, 0.5]], [0.0, 1.0], [1.0, 0.0]), [[0.0, 1.0], [0.0, 0.0]], "a [^\n]*"),
+            (([[1.0]], [1.0], [1.0]), [[0.0]], "[^\n]*settles[^\n]*"),
+        ],
+    )
+    def test_disturbance_that_is_no_covariance_or_never_settles(self, system, Q, words):
+        motion = lift(FastSystem(*system), ExposureTiming(1.0, 1.0, 0.0, 1.0), Q)
+        with pytest.raises(DataError, match=f"^Q: expected {words}$"):
             steady_kalman(BlurModel(motion, MODEL.sensor))
 
     def test_delta_kernel_has_no_image_derivative(self):

@@ -45,7 +45,7 @@ WRONG = {
         **{"iterations": [0], "tolerance": [-1.0]},
     },
     NonlocalParams: {
-        **{"patch": [4], "search": [0, 103], "patch_sigma": [0.0], "nearest": [5], "best": [-1], "h": [0.0]},
+        **{"patch": [4], "search": [0, 103], "patch_sigma": [0.0], "nearest": [5], "best": [-1], "h": [0.0]}
     },
     RestoreParams: {"train": [1], "until": ["sharpen"], "keep_best": [0.0], "border": ["mirror"]},
     SteadyParams: {"camera": ["still"], "reach": [0], "sigma": [-1], "largest": [0]},

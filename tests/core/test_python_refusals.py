@@ -20,6 +20,10 @@ OPENED = r"use open_frames\(path\) or FrameSource\.from_array\(frames\)"
 
 # Calls, and the lines that refuse them.
 WRONG = {
+    "path to restore": (
+        lambda: tr.restore("clip.mkv"),
+        r".* the path clip\.mkv; open it with turbrestore\.open_frames",
+    ),
     "path of frames to filter_frames": (
         lambda: tr.filter_frames("clip.mkv", IMAGE, DYNAMICS),
         r"frames: expected arrays .* found the path clip\.mkv; open it with turbrestore\.open_frames",
@@ -42,10 +46,7 @@ WRONG = {
         lambda: tr.filter_frames(FRAMES * 255, IMAGE, DYNAMICS),
         f"frame 0: {RANGE}; {SCALE}",
     ),
-    "reference of 255": (
-        lambda: tr.filter_frames(FRAMES, IMAGE * 255, DYNAMICS),
-        f"reference: {RANGE}; {SCALE}",
-    ),
+    "reference of 255": (lambda: tr.filter_frames(FRAMES, IMAGE * 255, DYNAMICS), f"reference: {RANGE}; {SCALE}"),
     "frames of 255 to estimate_flow": (lambda: tr.estimate_flow(IMAGE, FRAMES * 255), f"frames: {RANGE}; {SCALE}"),
     "image of 255 to estimate_flow": (lambda: tr.estimate_flow(IMAGE * 255, FRAMES), f"reference: {RANGE}; {SCALE}"),
     "image of 255": (lambda: tr.deconvolve(IMAGE * 255, 1.0), f"image: {RANGE}; {SCALE}"),

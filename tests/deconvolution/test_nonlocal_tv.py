@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from turbrestore.deconvolution.nonlocal_prior import nonlocal_tv
 from turbrestore.deconvolution.nonlocal_prior.nonlocal_tv import NonlocalPenalty, add_adjoint, add_gradient, add_squares
 from turbrestore.deconvolution.nonlocal_prior.nonlocal_weights import NonlocalGraph, NonlocalParams, nonlocal_weights
-from turbrestore.runtime.threads import ThreadTeam
 
 SMALL = NonlocalParams(patch=3, search=5, best=3)
 
@@ -44,19 +43,6 @@ def test_ascent_is_a_relaxed_projection(graph, relaxation):
         assert adjoint == pytest.approx(-pairs.divergence(graph, p), abs=2e-5)
         assert p_of(graph, dual) == pytest.approx(p, abs=2e-5)
     assert np.abs(p).max() > 0.5
-
-
-def test_threads_change_nothing(graph, monkeypatch):
-    image, found = np.random.default_rng(3).normal(size=graph.shape).astype(np.float32), []
-    monkeypatch.setattr(nonlocal_tv, "PARALLEL_PIXELS", 1)
-    for workers in (1, 2, 4):
-        with ThreadTeam(workers) as team:
-            penalty = NonlocalPenalty(graph, team)
-            dual = None
-            for _ in range(3):
-                dual, adjoint = penalty.ascend(dual, image, 0.7, 1.4)
-            found.append(adjoint.tobytes())
-    assert len(set(found)) == 1
 
 
 def test_bands_of_one_half_share_no_pixels(graph):

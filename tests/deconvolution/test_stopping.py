@@ -16,16 +16,7 @@ from turbrestore.blur.psf import KOLMOGOROV, blur_otf
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.deconvolution.primal_dual import REST
 from turbrestore.deconvolution.problem import MARGIN_SIGMAS, Problem, margin_around
-from turbrestore.deconvolution.stopping import (
-    FEWEST,
-    MOST,
-    SPAN,
-    TILE,
-    change_of,
-    iterate,
-    predicted_change,
-    tile_sums,
-)
+from turbrestore.deconvolution.stopping import FEWEST, MOST, SPAN, TILE, change_of, iterate, predicted_change, tile_sums
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.steps import finish
 from turbrestore.synthesis.scenes import SCENES

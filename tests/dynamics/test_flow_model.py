@@ -36,16 +36,6 @@ def test_full_rank_reconstructs_the_flows(noise_flows):
     assert dynamics.energy_share == pytest.approx(1.0)
 
 
-def test_projection_undoes_the_flow_of_a_state(rng, noise_flows):
-    dynamics = identify(noise_flows, DynamicsParams(rank=7))
-    state = rng.standard_normal(7)
-    deviation = flow_of(dynamics, state) - dynamics.mean_flow
-    np.testing.assert_allclose(project_deviation(dynamics, deviation), state, atol=1e-5)
-    flow = noise_flows[4]
-    rest = flow - flow_of(dynamics, project_deviation(dynamics, flow - dynamics.mean_flow))
-    np.testing.assert_allclose(dynamics.C.T @ rest.reshape(-1), 0, atol=1e-5)
-
-
 def test_inputs_are_left_alone(noise_flows):
     before = noise_flows.copy()
     dynamics = identify(noise_flows, DynamicsParams(rank=3))

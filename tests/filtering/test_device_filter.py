@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from torch_devices import DEVICES, on_devices
+from torch_devices import DEVICES, frames_of, on_devices
 
 from conftest import SCENES, make_sequence
 from turbrestore.core.arrays import luminance
@@ -12,17 +12,8 @@ from turbrestore.filtering.filter_records import FilterParams
 from turbrestore.filtering.frame_noise import warp_frame
 from turbrestore.runtime.image_stacks import load, store
 from turbrestore.runtime.runtime import Runtime
-from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
 SIZE = 72
-
-
-def frames_of(scene, count):
-    """Frames of a scene in turbulent motion, and the flows."""
-    rng = np.random.default_rng(4)
-    params = SmoothFlowParams(rms=1.5, correlation_length=8.0, persistence=0.5)
-    flows = smooth_flows(count, *scene.shape[:2], rng, params)
-    return distort(scene, flows, rng, blur=0.8, noise=0.01), flows
 
 
 def coloured(scene):
@@ -52,14 +43,14 @@ def assert_alike(here, there, tolerance):
 @pytest.mark.parametrize("sharpness", [2.0, 0.0])
 def test_image_and_variance_are_those_of_the_cpu(device, colour, sharpness):
     scene = SCENES["camera"](SIZE)[:, :-5]
-    frames, flows = frames_of(coloured(scene) if colour else scene, 6)
+    frames, flows = frames_of(coloured(scene) if colour else scene, 6, seed=4)
     both = filter_both(frames, flows, flows, device, sharpness=sharpness, image_drift=1e-4, prior_frames=2)
     assert_alike(*both, 1e-5)
 
 
 @on_devices
 def test_folds_and_samples_beyond_the_frame_count_as_little(device):
-    frames, flows = frames_of(SCENES["camera"](SIZE), 6)
+    frames, flows = frames_of(SCENES["camera"](SIZE), 6, seed=4)
     torn = flows + np.random.default_rng(5).normal(0, 0.8, flows.shape).astype(np.float32)
     here, there = filter_both(frames, torn, torn, device)
     assert_alike(here, there, 1e-4)
@@ -68,7 +59,7 @@ def test_folds_and_samples_beyond_the_frame_count_as_little(device):
 
 @on_devices
 def test_a_foreign_frame_has_a_finite_noise_however_much_sharpness_counts(device):
-    frames, flows = frames_of(SCENES["camera"](SIZE), 12)
+    frames, flows = frames_of(SCENES["camera"](SIZE), 12, seed=4)
     known = flows.copy()
     # Its gradient is against that of the scene, and its flow folds.
     frames[8] = 1 - frames[8]

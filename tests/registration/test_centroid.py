@@ -19,7 +19,6 @@ from turbrestore.registration.flow import FlowParams
 from turbrestore.registration.flow_algebra import invert_flow
 from turbrestore.registration.warp import warp
 from turbrestore.runtime.runtime import Runtime
-from turbrestore.runtime.scratch import to_scratch
 from turbrestore.runtime.steps import finish
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
@@ -122,11 +121,6 @@ def test_frames_are_not_changed_and_colour_is_kept(sequence):
     assert (frames == before).all()
 
 
-def test_mean_registered_of_still_frames_is_the_mean():
-    frames = np.random.default_rng(0).random((3, 8, 8)).astype(np.float32)
-    assert np.allclose(mean_registered(frames, np.zeros((3, 8, 8, 2), np.float32)), frames.mean(axis=0), atol=1e-6)
-
-
 @pytest.mark.parametrize(("jitter", "drift"), [(8.0, 0.0), (0.0, 50.0)])
 def test_a_moving_camera_costs_nothing(jitter, drift):
     rng = np.random.default_rng(3)
@@ -192,28 +186,12 @@ def test_a_state_follows_each_flow_and_the_result_is_returned(sequence):
     assert result.flows.tobytes() == expected.flows.tobytes()
 
 
-def test_threads_do_not_change_a_byte(sequence):
-    one, three = (find_centroid(sequence.frames[:6], runtime=Runtime(threads=n)) for n in (1, 3))
-    assert one.image.tobytes() == three.image.tobytes()
-    assert one.flows.tobytes() == three.flows.tobytes()
-
-
 def test_a_centroid_may_be_left_early(sequence):
     before = set(threading.enumerate())
     steps = centroid_steps(sequence.frames[:6], runtime=Runtime(threads=2))
     assert next(steps) == CentroidState(1, 1)
     steps.close()
     assert set(threading.enumerate()) <= before
-
-
-def test_flows_in_a_file_are_those_in_memory(sequence, tmp_path):
-    frames = sequence.frames[:4]
-    here, there = (
-        find_centroid(to_scratch(frames, folder), runtime=Runtime(scratch=folder)) for folder in (None, tmp_path)
-    )
-    assert isinstance(there.flows, np.memmap)
-    assert np.array_equal(here.flows, there.flows)
-    assert np.array_equal(here.image, there.image)
 
 
 @pytest.mark.parametrize("scratch", [False, True])

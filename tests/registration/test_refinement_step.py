@@ -97,12 +97,6 @@ def test_images_may_have_odd_sides():
     assert np.abs(found[4:-4, 4:-4]).mean() < 0.05
 
 
-def test_the_start_is_not_overwritten():
-    start = np.zeros((24, 24, 2), np.float32)
-    flow_refinement(to_8_bits(texture(48)))(to_8_bits(np.roll(texture(48), 1, 0)), start)
-    assert not start.any()
-
-
 def test_compiled_loops_do_what_their_text_says():
     rng, shape = np.random.default_rng(0), (17, 23)
     frame, reference = rng.integers(0, 256, (2, *shape)).astype(np.uint8)

@@ -62,17 +62,6 @@ def test_a_frame_that_others_are_registered_to_has_noise_of_its_own(frames):
     assert found.deviation == pytest.approx(NOISE, rel=0.1)
 
 
-def test_texture_that_lasts_shows_in_beginning_and_end_only():
-    rng, scene, state, frames = np.random.default_rng(1), SCENES["camera"](*SHAPE), None, []
-    for _ in range(COUNT):
-        fresh = smooth_noise(rng)
-        state = fresh if state is None else 0.9 * state + np.sqrt(1 - 0.81) * fresh
-        frames.append(scene + state)
-    clip = halve(np.array(frames), still(), SHAPE, COUNT)
-    new, lasting = clip.alternate.noise(), clip.lasting.noise()
-    assert lasting.deviation > 3 * new.deviation
-
-
 def lasting_noise(rho, seed, count=COUNT):
     """Frames of smooth noise that is alike from frame to frame, about a scene, and the noise of their mean."""
     rng, scene, state, frames = np.random.default_rng(seed), SCENES["camera"](*SHAPE), None, []
@@ -102,9 +91,10 @@ def test_few_frames_tell_no_noise_that_they_share(count):
     np.testing.assert_array_equal(clip.noise.power, clip.alternate.noise().power)
 
 
-def test_texture_that_lives_for_several_frames_is_beyond_noise():
+def test_texture_that_lives_for_several_frames_is_beyond_noise_and_shows_in_beginning_and_end_only():
     frames, _ = lasting_noise(0.9, 1)
     clip = halve(frames, still(), SHAPE, COUNT)
+    assert clip.lasting.noise().deviation > 3 * clip.alternate.noise().deviation
     assert clip.beyond > 0.1 * NOISE**2
     assert clip.noise.deviation > 2 * clip.alternate.noise().deviation
 

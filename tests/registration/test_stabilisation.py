@@ -6,12 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbrestore.core.errors import DataError
-from turbrestore.registration.camera.global_shift import (
-    global_shifts,
-    measure_shift,
-    overlap,
-    prepare_shift_reference,
-)
+from turbrestore.registration.camera.global_shift import global_shifts, measure_shift, overlap, prepare_shift_reference
 from turbrestore.registration.camera.stabilisation import mean_stabilised
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
@@ -80,19 +75,6 @@ def test_a_drift_past_the_middle_frame_is_followed():
     starts = np.arange(0, 400, 20)
     frames = np.stack([PHOTO[100:200, x : x + 100] for x in starts])
     assert global_shifts(frames)[:, 0] == pytest.approx(starts.mean() - starts, abs=1.5)
-
-
-def test_shifts_are_counted_from_their_mean():
-    places = [(30, 0), (20, 10), (0, 10), (10, 20)]
-    shifts = global_shifts(np.stack([seen_from(*place) for place in places]))
-    assert shifts == pytest.approx(places - np.mean(places, axis=0), abs=0.5)
-    assert np.abs(shifts.mean(axis=0)).max() < 1e-9
-
-
-def test_mean_of_shaken_frames_is_sharp_and_in_the_middle():
-    places = np.array([(24, 0), (-24, 8), (0, -8)])
-    mean = mean_stabilised(np.stack([seen_from(*place) for place in places]))
-    assert np.abs(mean - seen_from(0, 0)).max() < 1e-6
 
 
 def test_frames_within_the_dead_zone_are_averaged_as_they_are():

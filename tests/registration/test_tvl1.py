@@ -8,7 +8,6 @@ from scipy.optimize import minimize
 from torch_devices import NO_TORCH
 
 from turbrestore.core.errors import ConfigurationError, DataError
-from turbrestore.registration.flow import FlowParams, estimate_flow
 from turbrestore.registration.flow_methods.tvl1 import TvL1Params, prepare_tvl1, tvl1_flows
 from turbrestore.registration.flow_methods.tvl1_sweeps import (
     FlowProblem,
@@ -20,7 +19,6 @@ from turbrestore.registration.flow_methods.tvl1_sweeps import (
     sweep_frame,
 )
 from turbrestore.registration.warp import warp
-from turbrestore.runtime.runtime import Runtime
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
 
 SIZE = 96
@@ -241,10 +239,6 @@ class TestMotion:
         assert error.mean() < 0.03
         assert error.max() < 0.15
 
-    def test_equal_images_do_not_move(self):
-        image = texture(2)
-        assert np.abs(tvl1_flows(image[None], prepare_tvl1(image)).flows).max() < 1e-4
-
     def test_smooth_motion_is_followed_better_than_by_total_variation(self):
         frame, truth = texture(5), smooth_flows(1, SIZE, SIZE, np.random.default_rng(5))[0]
         errors = [
@@ -271,15 +265,6 @@ class TestMotion:
         found = tvl1_flows(scene[None, :96, 7:103], prepare_tvl1(scene[:96, 16:112])).flows[0]
         # The last nine columns of the reference are not in the frame and move with their neighbours.
         assert np.abs(found - flow)[12:-12, 4:].max() < 0.5
-
-    def test_energy_falls_level_by_level(self):
-        reference, frames, _ = pairs(1, seed=8)
-
-        def misfit(flow):
-            return np.abs(warp(frames[0], flow) - reference).mean()
-
-        found = tvl1_flows(frames, prepare_tvl1(reference)).flows[0]
-        assert misfit(found) < 0.15 * misfit(np.zeros_like(found))
 
 
 class TestEnd:
@@ -348,14 +333,6 @@ class TestManyToOne:
         assert together.warps.tolist() == [int(one.warps[0]) for one in alone]
         # Frames of a batch settle one by one.
         assert len(set(together.warps)) > 1
-
-    def test_threads_do_not_change_a_byte(self):
-        reference, frames, _ = pairs(7, seed=15)
-        one, two, many = (
-            estimate_flow(reference / 255, frames / 255, FlowParams(method="tvl1"), Runtime(threads=n))
-            for n in (1, 2, 5)
-        )
-        assert one.tobytes() == two.tobytes() == many.tobytes()
 
     @pytest.mark.parametrize("device", DEVICES)
     def test_nothing_that_is_handed_in_changes(self, device):

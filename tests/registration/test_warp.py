@@ -4,11 +4,6 @@ import pytest
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.registration.flow_algebra import compose_flows, invert_flow
 from turbrestore.registration.warp import inside, warp
-from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
-
-
-def smooth_flow(rng, size=48, rms=1.5):
-    return smooth_flows(1, size, size, rng, SmoothFlowParams(rms=rms, correlation_length=10.0))[0]
 
 
 @pytest.mark.parametrize("shape", [(150, 330), (330, 150), (90, 270, 3), (1, 40)])
@@ -34,11 +29,6 @@ def test_shifts_below_a_32nd_of_a_pixel_are_exact(shift):
         assert np.abs(moved - shift).max() < 1e-5
 
 
-def test_zero_flow_changes_nothing():
-    image = np.random.default_rng(0).random((9, 11)).astype(np.float32)
-    assert (warp(image, np.zeros((9, 11, 2)), "linear") == image).all()
-
-
 def test_warp_follows_the_sign_rule():
     reference = np.zeros((8, 8), np.float32)
     frame = np.zeros((8, 8), np.float32)
@@ -60,7 +50,7 @@ def test_inside_is_what_a_linear_warp_of_ones_between_zeros_gives():
 
 def test_arguments_are_not_changed():
     rng = np.random.default_rng(3)
-    image, flow = rng.random((16, 16)).astype(np.float32), smooth_flow(rng, 16)
+    image, flow = rng.random((16, 16)).astype(np.float32), rng.normal(0, 1, (16, 16, 2)).astype(np.float32)
     copies = image.copy(), flow.copy()
     warp(image, flow), warp(image, flow, "linear"), inside(flow), invert_flow(flow), compose_flows(flow, flow)
     assert (image == copies[0]).all()

@@ -6,13 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from turbrestore.core.errors import ConfigurationError
-from turbrestore.runtime.tiling import (
-    add_tile,
-    cut_tile,
-    halo_tiles,
-    largest_tile,
-    new_mosaic,
-)
+from turbrestore.runtime.tiling import add_tile, cut_tile, halo_tiles, largest_tile, new_mosaic
 
 
 @pytest.mark.long

@@ -39,12 +39,6 @@ def test_an_error_reaches_the_caller_and_no_thread_is_left():
     assert set(threading.enumerate()) <= before
 
 
-def test_opencv_threads_are_given_back():
-    before = cv2.getNumThreads()
-    list(map_ahead(abs, [1]))
-    assert cv2.getNumThreads() == before
-
-
 def test_streams_that_are_worked_on_in_turns_give_the_threads_back():
     before = cv2.getNumThreads()
     cv2.setNumThreads(2)
@@ -229,7 +223,7 @@ def test_a_restoration_is_the_same_bytes_whatever_the_number_of_threads(monkeypa
     monkeypatch.setattr("turbrestore.dynamics.dynamic_texture._STRIP_BYTES", 1 << 16)
     monkeypatch.setattr("turbrestore.deconvolution.deconvolve.PARALLEL_PIXELS", 0)
     monkeypatch.setattr("turbrestore.deconvolution.nonlocal_prior.nonlocal_tv.PARALLEL_PIXELS", 0)
-    frames = make_sequence(seed=3, count=16).frames[:, :64, :80]
+    frames = make_sequence(seed=3, count=16).frames[:, :48, :64]
 
     def run(threads):
         return restore(frames, RestoreParams(train=8, flow=FlowParams(method)), Runtime(threads=threads))

@@ -4,7 +4,7 @@ import numpy as np
 from scipy import special
 
 from turbrestore.synthesis.atmosphere import phase_spectrum
-from turbrestore.synthesis.phase_screen import sample_lattice
+from turbrestore.synthesis.phase_screen import Turbulence, draw_screen, sample_lattice
 
 # D_φ(r) = 6.884 (r/r0)^(5/3).
 STRUCTURE = 2 * (24 / 5 * special.gamma(6 / 5)) ** (5 / 6)
@@ -35,6 +35,17 @@ def sample_path(screen, x, y):
     smooth = (np.exp(-2j * np.pi * phases) @ screen.waves).real
     (flat,) = sample_lattice(screen, [screen.path], u.reshape(1, -1), v.reshape(1, -1))
     return np.asarray(smooth + flat.reshape(u.shape), np.float32)
+
+
+def small_turbulence(params, seed, points, across):
+    """Path whose square lattices have few points a side, with some across an aperture: cheap to draw."""
+    rng, layers = np.random.default_rng(seed), params.path()
+    screens = []
+    for layer in layers:
+        aperture, scales = layer.shrink * params.aperture, (params.outer_scale, params.inner_scale)
+        optics = {"wavelength": params.wavelength, "aperture": aperture}
+        screens.append(draw_screen(points, aperture / across, layer.r0, *scales, rng, **optics))
+    return Turbulence(params, layers, tuple(screens))
 
 
 def tilt_covariance(layers, aperture, wavelength, outer_scale, inner_scale=0.0, angle=(0.0, 0.0), lag=0.0):

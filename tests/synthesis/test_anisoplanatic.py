@@ -12,6 +12,7 @@ from atmosphere_theory import (
     long_exposure_mtf,
     sample_path,
     short_exposure_mtf,
+    small_turbulence,
     structure_function,
 )
 
@@ -21,14 +22,8 @@ from turbrestore.registration.warp import warp
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.synthesis.anisoplanatic import diffraction_limited, phase_screen_frames
 from turbrestore.synthesis.atmosphere import PhaseScreenParams
-from turbrestore.synthesis.phase_screen import Turbulence, draw_screen, draw_turbulence, tilt_flow
-from turbrestore.synthesis.pupil import (
-    point_spread_functions,
-    psf_basis,
-    pupil_mask,
-    sample_pupil,
-    tilt_free_path,
-)
+from turbrestore.synthesis.phase_screen import draw_turbulence, tilt_flow
+from turbrestore.synthesis.pupil import point_spread_functions, psf_basis, pupil_mask, sample_pupil, tilt_free_path
 from turbrestore.synthesis.scenes import resolution_chart
 from turbrestore.synthesis.sequence import CameraParams, record
 
@@ -48,18 +43,6 @@ def path_of(**given):
 
 def frames_of(scene, count=2, seed=0, params=None, camera=NOISELESS):
     return list(phase_screen_frames(scene, count, np.random.default_rng(seed), params or path_of(), camera))
-
-
-def small_turbulence(params, seed):
-    """Lattices four apertures wide, which serve a single field point, and fine enough for the whole of the phase."""
-    rng = np.random.default_rng(seed)
-    layers = params.path()
-    screens = [
-        draw_screen(192, layer.shrink * params.aperture / 48, layer.r0, params.outer_scale, params.inner_scale, rng,
-                    wavelength=params.wavelength, aperture=layer.shrink * params.aperture)
-        for layer in layers
-    ]  # fmt: skip
-    return Turbulence(params, layers, tuple(screens))
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +65,7 @@ def exposures(request):
     frequencies = SHIFTS / params.pupil_samples * params.aperture / params.wavelength
     short, long = [], []
     for seed in range(DRAWS):
-        turbulence = small_turbulence(params, seed)
+        turbulence = small_turbulence(params, seed, 192, 48)
         pupil = sample_pupil(turbulence)
         drifts = np.random.default_rng(seed).uniform(0, 1000, (24, 2, 2))
         paths = np.concatenate([tilt_free_path(turbulence, pupil, ORIGIN, ORIGIN, drift) for drift in drifts])
@@ -153,7 +136,7 @@ def test_short_exposure_is_nearly_frieds(exposures):
 
 def test_little_light_falls_outside_the_window():
     params = path_of(d_over_r0=2.0)
-    turbulence = small_turbulence(params, 0)
+    turbulence = small_turbulence(params, 0, 192, 48)
     pupil = sample_pupil(turbulence)
     drifts = np.random.default_rng(0).uniform(0, 1000, (40, 2, 2))
     paths = np.concatenate([tilt_free_path(turbulence, pupil, ORIGIN, ORIGIN, drift) for drift in drifts])
@@ -236,7 +219,7 @@ def test_tilt_of_light_is_the_displacement_of_the_image():
 def test_waves_bend_over_the_pupil():
     # A lattice only four apertures wide leaves much of the phase without tilt to the waves.
     params = path_of(layers=1, d_over_r0=4.0, inner_scale=0.0)
-    turbulence = small_turbulence(params, 6)
+    turbulence = small_turbulence(params, 6, 192, 48)
     pupil, (layer,), (screen,) = sample_pupil(turbulence), turbulence.layers, turbulence.screens
     path = sample_path(screen, layer.shrink * pupil.x, layer.shrink * pupil.y).astype(np.float64)
     expected = path - (path @ pupil.planes.T) @ pupil.planes
@@ -257,17 +240,6 @@ def test_frames_follow_the_sign_rule(chart):
         )
         away = psnr(warp(frame.image, -frame.flow)[inside], truth[inside])
         assert back > moved + 3 > away
-
-
-def test_frames_drift_with_the_wind(chart):
-    def correlation(wind):
-        flows = np.stack([f.flow for f in frames_of(chart, 6, params=path_of(wind=(wind,)))])
-        return np.mean(flows[1:] * flows[:-1]) / np.mean(flows**2)
-
-    assert frames_of(chart, 2, params=path_of(wind=(0.0,)))[1].flow == pytest.approx(
-        frames_of(chart, 1, params=path_of(wind=(0.0,)))[0].flow
-    )
-    assert correlation(0.5) > correlation(3.0) + 0.1
 
 
 def test_the_pattern_moves_with_the_wind():
@@ -309,17 +281,6 @@ def test_colour_channels_share_the_flow_and_not_the_blur():
     assert frames_of(photo, 1, params=one)[0].image.mean(axis=(0, 1)) == pytest.approx(
         photo.mean(axis=(0, 1)), abs=0.01
     )
-
-
-def test_stronger_turbulence_moves_and_blurs_more(chart):
-    found = []
-    for strength in (0.5, 1.5, 4.0):
-        frames = frames_of(chart, 2, params=path_of(d_over_r0=strength))
-        sharpness = np.mean([np.abs(cv2.Laplacian(frame.image, cv2.CV_32F)).mean() for frame in frames])
-        found.append((np.std([frame.flow for frame in frames]), sharpness))
-    motion, sharpness = np.transpose(found)
-    assert (np.diff(motion) > 0).all()
-    assert (np.diff(sharpness) < 0).all()
 
 
 def test_exposure_averages_the_motion(chart):

@@ -12,13 +12,7 @@ from atmosphere_theory import (
 from scipy import special
 
 from turbrestore.core.errors import ConfigurationError
-from turbrestore.synthesis.atmosphere import (
-    Layer,
-    PhaseScreenParams,
-    fried_parameter,
-    phase_spectrum,
-    tilt_variance,
-)
+from turbrestore.synthesis.atmosphere import Layer, PhaseScreenParams, fried_parameter, phase_spectrum, tilt_variance
 
 WAVELENGTH, APERTURE = 550e-9, 0.1
 
