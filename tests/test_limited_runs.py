@@ -35,7 +35,7 @@ TWO = Runtime(threads=2)
 
 @pytest.fixture(scope="module")
 def frames():
-    return make_sequence(seed=51, count=24, size=96, blur=1.0).frames
+    return make_sequence(seed=51, count=20, size=96, blur=1.0).frames
 
 
 def limit_that(shape, holds, params=QUICK):
@@ -94,9 +94,9 @@ def test_a_truth_in_the_folder_of_the_stages_is_refused(frames, tmp_path, monkey
 
 
 def test_a_limit_for_a_run_that_does_not_deconvolve(frames):
-    params = replace(QUICK, train=24, until="centroid", deconvolution=DeconvolutionParams())
+    params = replace(QUICK, train=20, until="centroid", deconvolution=DeconvolutionParams())
     limit = limit_that(frames.shape, in_scratch, params)
-    assert pipeline.restore(frames, params, replace(TWO, memory_limit=limit)).train == 24
+    assert pipeline.restore(frames, params, replace(TWO, memory_limit=limit)).train == 20
 
 
 def test_the_result_is_the_same_bit_for_bit(frames, limited, tmp_path):
@@ -150,7 +150,7 @@ def test_a_stage_depends_on_the_size_of_the_tiles():
 def test_the_command_restores_large_frames_in_tiles(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     # Wide frames, so that the whole is out of reach at a size that a test has time for.
-    frames = np.tile(make_sequence(seed=53, count=3, size=200, blur=1.0).frames, (1, 2, 4))
+    frames = np.tile(make_sequence(seed=53, count=2, size=200, blur=1.0).frames, (1, 2, 4))
     np.save("clip.npy", frames)
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))

@@ -21,7 +21,7 @@ from turbrestore.pipeline import restore
 from turbrestore.results import Restoration
 from turbrestore.settings import RestoreParams
 
-COUNT = 24
+COUNT = 20
 FUSED = RestoreParams(until="filter")
 
 
@@ -98,8 +98,8 @@ class TestLight:
 def shaken():
     """The scene under a camera that moves by some pixels."""
     rng = np.random.default_rng(2)
-    clip = make_sequence(9, 24, 170, "camera", blur=0.8, noise=0.008, rms=0.8)
-    places = 28 + np.rint(np.clip(rng.normal(0, 7, (24, 2)), -20, 20)).astype(int)
+    clip = make_sequence(9, COUNT, 170, "camera", blur=0.8, noise=0.008, rms=0.8)
+    places = 28 + np.rint(np.clip(rng.normal(0, 7, (COUNT, 2)), -20, 20)).astype(int)
     return u8(np.stack([frame[y : y + 112, x : x + 112] for frame, (x, y) in zip(clip.frames, places, strict=True)]))
 
 
@@ -163,7 +163,7 @@ class TestOverlays:
 
     def test_given_as_a_file(self, shaken, uncovered, tmp_path):
         covered, mask = shaken.copy(), np.zeros((112, 112), np.float32)
-        covered[:, 40:44, 20:60] = np.random.default_rng(0).integers(0, 255, (24, 4, 40))
+        covered[:, 40:44, 20:60] = np.random.default_rng(0).integers(0, 255, (COUNT, 4, 40))
         mask[40:44, 20:60] = 1
         write_image(tmp_path / "mask.png", mask, 8)
         params = replace(FUSED, static_mask=str(tmp_path / "mask.png"))
