@@ -56,6 +56,13 @@ def limited(frames):
     return replace(TWO, memory_limit=limit_that(frames.shape, in_scratch))
 
 
+@pytest.fixture(scope="module")
+def kept(frames, tmp_path_factory):
+    """The folder and the result of a run without a limit."""
+    folder, source = tmp_path_factory.mktemp("kept"), FrameSource.from_array(frames)
+    return folder, pipeline.restore(source, QUICK, TWO, RunFolder(folder, source, QUICK, TWO))
+
+
 def test_the_truth_is_not_in_memory_while_the_stages_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     sequence = make_sequence(seed=51, count=4, size=96, blur=1.0)
@@ -99,8 +106,8 @@ def test_a_limit_for_a_run_that_does_not_deconvolve(frames):
     assert pipeline.restore(frames, params, replace(TWO, memory_limit=limit)).train == 20
 
 
-def test_the_result_is_the_same_bit_for_bit(frames, limited, tmp_path):
-    free, found = (pipeline.restore(frames, QUICK, replace(runtime, scratch=tmp_path)) for runtime in (TWO, limited))
+def test_the_result_is_the_same_bit_for_bit(frames, limited, kept, tmp_path):
+    free, found = kept[1], pipeline.restore(frames, QUICK, replace(limited, scratch=tmp_path))
     assert isinstance(found.centroid.flows, np.memmap)
     assert isinstance(found.dynamics.C, np.memmap)
     for name in ("image", "mean"):
@@ -185,11 +192,10 @@ def test_the_command_says_what_the_limit_caused_and_leaves_no_file(frames, tmp_p
     assert not [path for path in Path("kept").iterdir() if path.name.startswith("turbrestore-")]
 
 
-def test_a_kept_run_continues_with_another_limit(frames, limited, tmp_path, monkeypatch):
+def test_a_kept_run_continues_with_another_limit(frames, limited, kept, tmp_path, monkeypatch):
     monkeypatch.setattr("turbrestore.io.npy._LARGE", 1000)
-    source = FrameSource.from_array(frames)
-    whole = pipeline.restore(source, QUICK, TWO, RunFolder(tmp_path, source, QUICK, TWO))
-    later = RunFolder(tmp_path, source, QUICK, limited, resume=True)
+    source, (folder, whole) = FrameSource.from_array(frames), kept
+    later = RunFolder(folder, source, QUICK, limited, resume=True)
     assert later.notes == ("continues after the deconvolution",)
     again = pipeline.restore(source, QUICK, limited, later)
     assert np.array_equal(again.image, whole.image)
