@@ -139,11 +139,6 @@ def dependencies(source, params, runtime):
     return stage_dependencies(source, params, plan_memory(source.shape, params, runtime))
 
 
-def test_a_limit_changes_nothing_that_a_stage_depends_on(frames, limited):
-    source = FrameSource.from_array(frames)
-    assert dependencies(source, QUICK, limited) == dependencies(source, QUICK, TWO)
-
-
 def test_a_stage_depends_on_the_size_of_the_tiles():
     source, params = FrameSource.from_array(np.zeros((12, 800, 1000))), replace(QUICK, train=None)
     limits = (2e9, float(least_limit(source.shape)))

@@ -255,6 +255,8 @@ def test_bad_input_is_refused(sequence, briefly_trained):
         filter_frames([], centroid.image, dynamics)
     with pytest.raises(DataError, match="at least 4, found 2"):
         filter_frames(sequence.frames[:2], centroid.image, dynamics, known_flows=centroid.flows)
+    with pytest.raises(DataError, match="^frames: expected at least one frame to count, found none$"):
+        filter_frames([None] * 9, centroid.image, dynamics, known_flows=centroid.flows)
     with pytest.raises(DataError, match="dynamics: expected flows of"):
         filter_frames(sequence.frames[:, :64], centroid.image[:64], dynamics)
 
@@ -331,12 +333,6 @@ def test_frames_that_do_not_count_change_the_flow_state_only():
     rest, flows = sequence.frames[counted], centroid.flows[counted[:8]]
     alone = filter_frames(rest, centroid.image, dynamics, params, known_flows=flows)
     assert np.abs(first.image - alone.image).mean() < 0.01
-
-
-def test_at_least_one_frame_has_to_count(sequence, briefly_trained):
-    centroid, dynamics = briefly_trained
-    with pytest.raises(DataError, match="^frames: expected at least one frame to count, found none$"):
-        filter_frames([None] * 9, centroid.image, dynamics, known_flows=centroid.flows)
 
 
 @pytest.mark.parametrize("known", [True, False])

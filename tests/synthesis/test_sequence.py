@@ -73,12 +73,6 @@ def test_flows_between_frames_are_linear_in_time():
             assert flow == pytest.approx((1 - share) * flows[k] + share * flows[k + 1], abs=1e-6)
 
 
-def test_an_instant_leaves_flows_as_they_are():
-    flows = smooth_flows(3, 16, 16, np.random.default_rng(2))
-    frames = list(flows_between(flows, CameraParams().sub_frame_shares()))
-    assert all((between == flow).all() for (between,), flow in zip(frames, flows[:2], strict=True))
-
-
 def test_what_cannot_be_is_refused():
     with pytest.raises(DataError, match="^sub_flows"):
         exposed_frame(spot(), [])
