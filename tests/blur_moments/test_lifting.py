@@ -109,6 +109,11 @@ class TestLift:
             lift(system, TIMING, np.eye(2))
         assert is_observable(lift(system, ExposureTiming(1e-3, 0.1, 0.2, 0.3), np.eye(2)).A, system.C)
 
+    def test_mirror_that_forgets_within_a_step_is_observable(self):
+        A, B = discretise(PAPER_2[0], PAPER_2[1], 1e-3)
+        lifted = lift(FastSystem(A, B, PAPER_2[2]), TIMING, np.eye(2))
+        assert np.abs(np.linalg.eigvals(lifted.A)).max() < 0.05
+
     @pytest.mark.parametrize(
         ("make", "named"),
         [

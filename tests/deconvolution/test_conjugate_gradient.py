@@ -121,3 +121,9 @@ def test_a_wave_behind_wieners_filter_has_the_amplitude_of_its_formula(cycles, e
     gain = otf / (otf**2 + laplacian / wiener_fidelity(image, noise))
     inside = np.s_[12:-12, 12:-12]
     assert found[inside] == pytest.approx((0.5 + gain * (image - 0.5))[inside], abs=0.01)
+
+
+def test_wieners_filter_of_less_noise_is_sharper():
+    image = cv2.GaussianBlur(data.camera()[60:188, 120:248].astype(np.float32) / 255, (0, 0), 1.5)
+    less, more = (np.abs(np.diff(wiener_filtered(image, 1.5, 2.0, noise))).mean() for noise in (0.002, 0.05))
+    assert less > more > 1.1 * np.abs(np.diff(image)).mean()

@@ -111,6 +111,13 @@ def test_norm_bound_holds_and_is_not_wasteful(params):
     assert graph.norm_squared() < 1.5 * exact
 
 
+def test_colour_guides_are_reduced_to_luminance():
+    grey = np.random.default_rng(8).random((8, 8)).astype(np.float32)
+    colour = np.repeat(grey[..., None], 3, axis=2)
+    a, b = nonlocal_weights(grey, SMALL), nonlocal_weights(colour, SMALL)
+    assert weight_matrix(a) == pytest.approx(weight_matrix(b), abs=1e-4)
+
+
 def test_a_single_pixel_has_no_neighbours():
     with pytest.raises(DataError, match="two pixels"):
         nonlocal_weights(np.zeros((1, 1)))
