@@ -52,7 +52,7 @@ def test_empty_and_text_files_are_refused(tmp_path, name):
 
 
 def test_a_tiff_file_of_numbers_of_an_unknown_kind_is_refused(tmp_path):
-    tifffile.imwrite(tmp_path / "a.tif", np.zeros((8, 10), np.uint8))
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros((8, 10), np.int16))
     with tifffile.TiffFile(tmp_path / "a.tif", mode="r+") as tiff:
         tiff.pages[0].tags["SampleFormat"].overwrite(0)
     with refused(DataError, "SampleFormat 0; convert the file"):
