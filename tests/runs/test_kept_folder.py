@@ -122,6 +122,27 @@ def test_nothing_is_written_through_a_link_in_the_folder(ended, capsys, name, mo
     assert (ended / "precious.txt").read_text() == "dear"
 
 
+@pytest.mark.parametrize("call", ["os.open", "fcntl.flock", "os.fstat"])
+def test_a_signal_while_a_folder_is_being_held_leaves_nothing(tmp_path, monkeypatch, call):
+    pytest.importorskip("fcntl", reason="Windows delivers no signals there")
+    module, name = call.split(".")
+    real, calls = getattr(sys.modules[module], name), []
+
+    def interrupted(*words):
+        found = real(*words)
+        calls.append(found)
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        return found
+
+    monkeypatch.setattr(call, interrupted)
+    with pytest.raises(KeyboardInterrupt), lock_folder(tmp_path / "kept"):
+        pytest.fail("the folder was held")
+    assert list(tmp_path.iterdir()) == []
+    with lock_folder(tmp_path / "kept"):
+        assert (tmp_path / "kept" / LOCK).exists()
+
+
 def test_the_lock_is_made_where_it_belongs(tmp_path):
     (tmp_path / "kept").mkdir()
     (tmp_path / "kept" / LOCK).symlink_to(tmp_path / "elsewhere")

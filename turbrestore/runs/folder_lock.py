@@ -23,7 +23,7 @@ def lock_folder(folder: str | os.PathLike[str]) -> Iterator[bool]:
     file in the folder, on Windows one of ``LockFile``. Network file systems lock across machines as far as their server
     does.
     """
-    place = Path(folder)
+    place, is_new = Path(folder), False
     try:
         is_new = not place.exists()
         place.mkdir(exist_ok=True)
@@ -33,18 +33,29 @@ def lock_folder(folder: str | os.PathLike[str]) -> Iterator[bool]:
         raise OutputError(message) from error
     except OSError as error:
         raise OutputError(f"{place}: cannot be written to ({error.strerror or error})") from error
+    except BaseException:
+        # A signal came before the folder was held.
+        with suppress(OSError):
+            descriptor, _ = _acquire(place / LOCK)
+            _release(place, descriptor, is_new)
+        raise
     try:
         yield locks
     finally:
-        # Others must not see it free before it is gone.
-        removed = _remove(place / LOCK)
-        os.close(descriptor)
-        if not removed:
-            # Windows removes no file that is open, neither this one before nor that of another run now.
-            _remove(place / LOCK)
-        if is_new:
-            with suppress(OSError):
-                place.rmdir()
+        _release(place, descriptor, is_new)
+
+
+def _release(place: Path, descriptor: int, is_new: bool) -> None:
+    """Remove and close the file that is locked, and a new folder if it is empty."""
+    # Others must not see it free before it is gone.
+    removed = _remove(place / LOCK)
+    os.close(descriptor)
+    if not removed:
+        # Windows removes no file that is open, neither this one before nor that of another run now.
+        _remove(place / LOCK)
+    if is_new:
+        with suppress(OSError):
+            place.rmdir()
 
 
 def _remove(path: Path) -> bool:
@@ -64,7 +75,7 @@ def _acquire(path: Path) -> tuple[int, bool]:
             # The holder before may have removed the file between our opening and our locking it.
             if _is_at(descriptor, path):
                 return descriptor, locks
-        except OSError:
+        except BaseException:
             os.close(descriptor)
             raise
         os.close(descriptor)
