@@ -62,7 +62,7 @@ def test_every_doubt_is_named_once_with_a_remedy(restoration):
         CheckKind.SATURATED: {"decisions": (Decision("saturation", "", "3% are white", CheckKind.SATURATED),)},
         CheckKind.LARGE_MOTION: {"decisions": (Decision("motion", "", "9 pixels", CheckKind.LARGE_MOTION),)},
         CheckKind.SCENE_CHANGES: {"is_mean": True, "structure": StructureReading(0.05, 0.6, 0.2)},
-        CheckKind.CONTRADICTION: {"is_mean": True, "structure": StructureReading(0.05, 0.1, 0.2)},
+        CheckKind.CONTRADICTION: {"is_mean": True, "structure": StructureReading(0.07, 0.2, 0.2)},
         CheckKind.MOTION: {"structure": StructureReading(0.0, 0.6, 0.0)},
         CheckKind.REPETITION: {"mean": coarse.astype(np.float32)},
         CheckKind.FEW_FRAMES: {"filtered": only(restoration, 7)},

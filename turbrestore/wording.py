@@ -18,7 +18,7 @@ from .registration.coverage import Rectangle
 from .registration.recentring import recentring_flow
 from .runtime.scratch import iter_frames
 from .seeing.strength import LARGEST_BLUR, Estimate, Seeing
-from .verification.structure import LASTING, LEFT, UNSEEN, StructureReading
+from .verification.structure import LASTING, LEFT, StructureReading
 
 # A frame counts if its weight is at least this share of the average weight.
 _COUNTS = 0.2
@@ -204,10 +204,10 @@ def explain_geometry(filtered: Filtered, dynamics: FlowDynamics) -> Decision:
 
 def explain_structure(reading: StructureReading) -> tuple[Decision, ...]:
     """Say why the mean of the frames is the result, or why no blur is removed."""
-    if reading.unseen > UNSEEN and not reading.unexplained_change:
+    if reading.unseen > reading.most_unseen and not reading.unexplained_change:
         reason = (
             f"{reading.unseen:.1%} of the edges of the filtered image occur in fewer than half of the frames (bound "
-            f"{UNSEEN:.0%})"
+            f"{reading.most_unseen:.1%}, because registration leaves {reading.left:.0%} of their differences)"
         )
         return (Decision("structure", "the mean of the frames is the result", reason),)
     if reading.changes:

@@ -15,9 +15,9 @@ Registration also follows texture that renews itself, such as the granulation of
 they look alike.  Two things tell that.  Registration leaves much of what the frames differ by, noise apart.  And much
 of what it leaves lasts: the beginning and the end of the clip differ by more than independent frames would.
 
-Unseen edges alone make the mean of the frames the result, because registration can explain most differences and still
-bend one row of bricks into the next.  A change of the scene does so only where registration leaves much; otherwise no
-blur is removed.
+Unseen edges make the mean of the frames the result, the more of them the less registration leaves: it can explain most
+differences and still bend one row of bricks into the next, but noise hides edges, too.  A change of the scene does so
+only where registration leaves much; otherwise no blur is removed.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from ..core.robust import spread
 from ..registration.warp import inside, warp
 from ..runtime.scratch import drop_pages
 
-# Largest share of unseen edges; share of the variance over the frames above which registration does not explain how
-# they differ; figures in benchmarks/decisions/guards.md.
+# Largest share of unseen edges, where registration leaves this share of the variance over the frames or more; figures
+# in benchmarks/decisions/guards.md.
 UNSEEN, LEFT = 0.03, 0.3
 # Share of what is left that lasts, from which the scene itself changes.  Recorded and simulated clips of scenes that do
 # not change have up to 0.04, textures that live for a tenth of the clip and longer 0.17 and more.
@@ -69,7 +69,12 @@ class StructureReading:
     @property
     def explained(self) -> bool:
         """Whether the filtered image may be the result."""
-        return self.unseen <= UNSEEN and not self.unexplained_change
+        return self.unseen <= self.most_unseen and not self.unexplained_change
+
+    @property
+    def most_unseen(self) -> float:
+        """Largest share of unseen edges, in inverse proportion to what registration leaves where that is little."""
+        return UNSEEN * max(LEFT / max(self.left, ROUNDING), 1.0)
 
     @property
     def unexplained_change(self) -> bool:
