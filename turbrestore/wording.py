@@ -207,7 +207,7 @@ def explain_structure(reading: StructureReading) -> tuple[Decision, ...]:
     if reading.unseen > reading.most_unseen and not reading.unexplained_change:
         reason = (
             f"{reading.unseen:.1%} of the edges of the filtered image occur in fewer than half of the frames (bound "
-            f"{reading.most_unseen:.1%}, because registration leaves {reading.left:.0%} of their differences)"
+            f"{reading.most_unseen:.1%}, as registration leaves {reading.left:.0%} of what frames differ by)"
         )
         return (Decision("structure", "the mean of the frames is the result", reason),)
     if reading.changes:

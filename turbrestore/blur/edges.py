@@ -49,8 +49,8 @@ _LIMB, _BACKGROUND = 0.2, 0.2
 # Black and white are these percentiles.  What exceeds black by less than this multiple of the noise, or by this share
 # of the range, which blurs with long tails spread around a body, is black.
 _BLACK, _WHITE, _BLACK_NOISE, _TAILS = 1, 99, 4.0, 0.02
-# Where the noise of black fills more of the range, grey scenes pass for black: 11 of 13 where it fills 0.27, none here.
-_TOLD = 0.1
+# Largest share of the range that the noise of black fills: at 0.27, 11 of 13 grey scenes pass for black, here none.
+_NOISY_BLACK = 0.1
 # Ratio of one width that is tried to the one before it.
 _RATIO = 1.05
 # Photographs are as soft as this, pixels; below it nothing is safe to remove.  Width and uncertainty of a sharp image.
@@ -181,7 +181,7 @@ def _widest_blur(image: FloatArray, exponent: float, widest: float) -> float:
 def has_black_background(image: FloatArray) -> bool:
     """Whether at least a fifth of an image (H, W) is evenly dark, as around a planet."""
     noise, (black, white) = estimate_noise(image), np.percentile(image, (_BLACK, _WHITE))
-    return bool(_BLACK_NOISE * noise <= _TOLD * (white - black) and np.isfinite(_background(image, noise)))
+    return bool(_BLACK_NOISE * noise <= _NOISY_BLACK * (white - black) and np.isfinite(_background(image, noise)))
 
 
 def _background(image: FloatArray, noise: float) -> float:
