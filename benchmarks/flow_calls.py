@@ -276,18 +276,20 @@ def _verdict(measured: dict[str, Curves], mean: Curves) -> tuple[list[str], bool
     """Say what a second buys on either side of the default, and which settings cost no clip more than is tolerated.
 
     The default is at the knee where a second buys more up to it than beyond it, and cheaper settings cost too much.
+    The fused image is judged: small changes of it may change the width of the blur that is removed from it.
     """
     lines = [
         "\n## The knee\n",
-        "Change in dB for each second of flow calls, from a cheaper setting to the default and from the default to "
-        f"a more expensive one. A default may change only where it costs no clip more than {TOLERATED} dB.\n",
+        "Change of the fused image in dB for each second of flow calls, from a cheaper setting to the default and "
+        "from the default to a more expensive one. The restored image is not judged: small changes may change the "
+        f"width of the blur that is removed. A default may change only where no clip loses more than {TOLERATED} dB.\n",
         "| setting | largest loss on a clip, dB | mean change, dB | flow calls | dB a second |",
         "|---|---:|---:|---:|---:|",
     ]
     default, rates, harmless = mean["default"], dict[str, float](), list[str]()
     for name, point in mean.items():
-        loss = max(curves["default"].restored - curves[name].restored for curves in measured.values())
-        change, calls = point.restored - default.restored, point.calls / default.calls - 1
+        loss = max(curves["default"].fused - curves[name].fused for curves in measured.values())
+        change, calls = point.fused - default.fused, point.calls / default.calls - 1
         if calls:
             rates[name] = change / (point.seconds - default.seconds)
         rate = f"{rates[name]:+.2f}" if name in rates else ""

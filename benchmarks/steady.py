@@ -100,6 +100,10 @@ CLIPS = {
         "hand-held": Clip("rocket", "hand", 417, rms=0.8),
         "façade, smooth": Clip((15, 11), "stand", 418, rms=0.8),
         "façade, creeping": Clip((10, 16), "creep", 419, rms=0.8),
+        "lattice of 4 pixels": Clip((4, 5), "slow pan", 421, 1.2),
+        "lattice of 6 pixels": Clip((6, 9), "pan", 422, 1.5),
+        "lattice of 8 pixels": Clip((8, 7), "slow pan", 423, 2.0),
+        "lattice of 12 pixels": Clip((12, 10), "brisk pan", 424, 2.5),
         "no air": Clip("coffee", "hand", 420),
     },
 }
@@ -116,6 +120,7 @@ def path(name: str, count: int, rng: np.random.Generator) -> np.ndarray:
         "slow creep": (0.05 * k, -0.08 * k),
         "pan": (0.6 * k, -0.2 * k),
         "slow pan": (-0.4 * k, 0 * k),
+        "brisk pan": (1.0 * k, 0.3 * k),
         "fast pan": (2.5 * k, 0.4 * k),
         "stop": (1.5 * np.clip(k, -20, 5), 0 * k),
         "stops": (stops - stops.mean(), 0 * k),

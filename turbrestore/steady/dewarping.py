@@ -53,7 +53,7 @@ from .settings import SteadyParams
 from .windows import Window, WindowFrame, light_between, normalised_image, relit
 
 # Patches this sparse lose nothing on phase screens; closer ones take a fifth longer.
-_FLOW = DisParams(finest_scale=0, patch_size=8, patch_stride=4, refinements=3, smoothness=10.0)
+_FLOW = DisParams(finest_scale=0, patch_size=8, patch_stride=4, refinements=1, smoothness=10.0)
 # Change of the light in a window, logarithm, of which half is taken out: cameras hunt by less, and lamps change more.
 _HUNTING = 0.25
 

@@ -32,8 +32,9 @@ _CONTRAST_WINDOW, _CONTRAST_FLOOR = 10.0, 0.01
 _SQUARE, _EXPOSED, _FEWEST = 8, (0.02, 0.95), 16
 # A gain that is as many times the scatter of the squares counts half.
 _SCATTER = 2.0
-# Smallest and largest logarithm of a gain, and the power of the intensity by which it fades towards white.
-_LEAST_LIGHT, _MOST_LIGHT, _WHITE = 0.005, 0.7, 8
+# Smallest and largest logarithm of a gain, and how often the intensity is squared for the power by which it fades
+# towards white: NumPy's power takes four times as long.
+_LEAST_LIGHT, _MOST_LIGHT, _WHITE_SQUARED = 0.005, 0.7, 3
 # Standard deviation of the shading that is taken off thumbnails, pixels of the thumbnail.
 _SHADING = 5.0
 
@@ -128,8 +129,17 @@ def relit(image: FloatArray, gain: FloatArray) -> FloatArray:
     """
     if not np.any(gain):
         return image
-    factor = np.exp(gain)
-    return image * factor / (1 + (factor - 1) * np.clip(image, 0, 1) ** _WHITE)
+    # Rows as they lie in memory: NumPy is slow along an axis of three.
+    rows = image.reshape(len(image), -1)
+    factor = np.broadcast_to(np.exp(gain), image.shape[1:]).ravel()
+    white = np.clip(rows, 0, 1)
+    for _ in range(_WHITE_SQUARED):
+        white *= white
+    white *= factor - 1
+    white += 1
+    np.divide(factor, white, out=white)
+    white *= rows
+    return white.reshape(image.shape)
 
 
 def _normalised(grey: FloatArray, shape: tuple[int, ...]) -> GreyImage:
