@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from turbrestore.steady.camera_path.path import LONGEST, _alikeness, smooth_motion
+from turbrestore.steady.displacement import camera_steadiness, displacement_sizes, whole_displacement
 
 SHAPE = (120, 160)
 
@@ -50,6 +51,20 @@ def test_slow_wander_of_whole_frames_is_averaged_over_the_longest_path():
 def test_a_pan_through_slow_wander_is_followed():
     shifts = wander(160, 0.8, np.random.default_rng(2))
     assert np.abs((steadied(shifts, velocity=2.0) - shifts[LONGEST:-12]).mean(0)).max() < 0.2
+
+
+def test_strong_air_moves_whole_frames_and_is_no_shake():
+    rng = np.random.default_rng(3)
+    path = {offset: np.zeros((2, 3)) for offset in (-12, -9, -6, -3, -1, 1, 3, 6, 9, 12)}
+    for camera in path.values():
+        camera[:, 2] = 1.5 * rng.standard_normal(2)
+    flows = {offset: 2 * rng.standard_normal((40, 50, 2)).astype(np.float32) for offset in path}
+    air = whole_displacement(displacement_sizes(flows)[0])
+    assert air == pytest.approx(1.4 * np.sqrt(2 * np.log(2) * 4 / 2), rel=0.05)
+    assert camera_steadiness(path, SHAPE, air) > 0.8
+    assert camera_steadiness(path, SHAPE, 0.0) < 0.5
+    shaken = {offset: 2.5 * camera for offset, camera in path.items()}
+    assert camera_steadiness(shaken, SHAPE, air) < 0.1
 
 
 PLACE = LONGEST + 10

@@ -37,7 +37,7 @@ from .camera_path.camera import Matrix, camera_flow, fit_camera
 from .camera_path.path import smooth_motion, without_shake
 from .displacement import (
     camera_steadiness,
-    displacement_size,
+    displacement_sizes,
     expected_motion,
     largest_displacement,
     mean_displacement,
@@ -90,8 +90,11 @@ def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
     removed_camera, displacement, largest = np.zeros((2, 3)), np.zeros((*grid, 2), np.float32), np.inf
     size, steadiness, path = 0.0, 1.0, np.zeros(grid, np.float32)
     if flows:
-        size = displacement_size(own)
-        steadiness = camera_steadiness({} if params.camera == "lock" else cameras, shape)
+        sizes = displacement_sizes(own)
+        size = float(np.mean(sizes))
+        # At the ends of a scene the motion of the camera does not cancel, and counts as shake.
+        whole = whole_displacement(sizes[0]) if {-1, 1} <= flows.keys() else 0.0
+        steadiness = camera_steadiness({} if params.camera == "lock" else cameras, shape, whole)
         largest = params.largest or largest_displacement(size, steadiness)
         removed_camera = (
             smooth_motion(cameras, whole_displacement(size, largest), shape)

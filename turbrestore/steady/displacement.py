@@ -20,7 +20,8 @@ all are large the frame stays as it is.  Without a neighbour on the other side m
 counts less where something moves.  The ½ is the share of the frame itself, whose flow to itself is zero.
 
 Curved motion and turbulence cannot be told apart in a few frames.  While the camera is static, so is most of a scene,
-and c follows the median of |S_i| between 1 and 4 pixels; while it moves, c is 1 pixel.
+and c follows the median of |S_i| between 1 and 8 pixels; while it shakes, c is 1 pixel.  Strong turbulence moves whole
+frames too, which is no shake: how far tells |S_1|, since flows to the nearest frames do not fail while a camera shakes.
 
 What moves
 ----------
@@ -48,8 +49,9 @@ from .camera_path.camera import Matrix, camera_flow, camera_size
 # Window in which |S|² is averaged, pixels; share of the frame itself.
 _WINDOW, _OWN_SHARE = 4.0, 0.5
 # c over the median of |S_i| while the camera is static; smallest and largest c, pixels.
-_SIZES, _LEAST, _MOST = 2.5, 1.0, 4.0
-# Distance of the camera from motion at constant velocity, pixels, at which it counts as half shaking.
+_SIZES, _LEAST, _MOST = 2.5, 1.0, 8.0
+# Distance of the camera from motion at constant velocity, pixels, at which it counts as half shaking; what turbulence
+# moves whole frames by comes on top.
 _SHAKE = 2.0
 # Path, in units of c, at which an S_i of one neighbour counts half.
 _PATH = 1.5
@@ -81,13 +83,14 @@ def mean_displacement(flows: Mapping[int, FloatArray], largest: float, path: Flo
     return np.asarray(total / weights, np.float32)
 
 
-def displacement_size(flows: Mapping[int, FloatArray]) -> float:
-    """Median of |S_i| over the image, mean over i.
+def displacement_sizes(flows: Mapping[int, FloatArray]) -> list[float]:
+    """Medians of |S_i| over the image, from the nearest neighbours to the furthest.
 
     ``flows`` (H, W, 2).
     """
-    means = [_symmetric(flows, distance)[::_SAMPLE, ::_SAMPLE] for distance in {abs(offset) for offset in flows}]
-    return float(np.mean([np.median(np.hypot(mean[..., 0], mean[..., 1])) for mean in means]))
+    distances = sorted({abs(offset) for offset in flows})
+    means = (_symmetric(flows, distance)[::_SAMPLE, ::_SAMPLE] for distance in distances)
+    return [float(np.median(np.hypot(mean[..., 0], mean[..., 1]))) for mean in means]
 
 
 def largest_displacement(size: float, steadiness: float) -> float:
@@ -95,7 +98,7 @@ def largest_displacement(size: float, steadiness: float) -> float:
     return _LEAST + (float(np.clip(_SIZES * size, _LEAST, _MOST)) - _LEAST) * steadiness
 
 
-def whole_displacement(size: float, largest: float) -> float:
+def whole_displacement(size: float, largest: float = np.inf) -> float:
     """Tell by what turbulence moves whole frames."""
     return _WHOLE * min(size, largest / _SIZES)
 
@@ -109,17 +112,17 @@ def expected_motion(cameras: Mapping[int, Matrix], offset: int) -> Matrix:
     return (line[0] + offset * line[1]).reshape(2, 3)
 
 
-def camera_steadiness(cameras: Mapping[int, Matrix], shape: tuple[int, ...]) -> float:
-    """Tell whether the camera moves at constant velocity within the window.
+def camera_steadiness(cameras: Mapping[int, Matrix], shape: tuple[int, ...], whole: float) -> float:
+    """Tell whether the camera moves at constant velocity within the window, but for what turbulence moves it.
 
-    ``cameras`` (2, 3).
+    ``cameras`` (2, 3); turbulence moves whole frames by ``whole`` pixels.
     """
     if not cameras:
         return 1.0
     offsets, path, line = _straight_path(cameras)
     left = path - np.stack([np.ones(len(offsets)), offsets], 1) @ line
-    size = np.sqrt(np.mean([camera_size(one, shape) ** 2 for one in left.reshape(-1, 2, 3)]))
-    return float(1 / (1 + (size / _SHAKE) ** 8))
+    square = np.mean([camera_size(one, shape) ** 2 for one in left.reshape(-1, 2, 3)])
+    return float(1 / (1 + (square / (_SHAKE**2 + whole**2)) ** 4))
 
 
 def without_camera(
