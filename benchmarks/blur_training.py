@@ -35,8 +35,8 @@ from turbrestore.blur.psf import GAUSSIAN, radial_otf
 from turbrestore.blur.witnesses.spectral_variation import RINGS, SIDE
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.noise_spectrum import NoiseSpectrum
-from turbrestore.deblurring import remove_blur
 from turbrestore.deconvolution.deconvolve import deconvolve
+from turbrestore.deconvolution.problem import largest_width
 from turbrestore.runtime.runtime import Runtime
 
 WEIGHTS = Path(__file__).resolve().parent.parent / "turbrestore" / "blur" / "learnt_blur.npz"
@@ -153,7 +153,7 @@ def errors_of(
     errors = np.full(len(widths), np.nan)
     params = DeconvolutionParams(exponent=exponent, iterations=ITERATIONS)
     for place, width in enumerate(widths):
-        if width * remove_blur.SIGMAS_A_SIDE > min(image.shape):
+        if width > largest_width(image.shape):
             break
         result = deconvolve(image, width, params, runtime=Runtime(threads=1), noise=noise).image
         errors[place] = np.mean(np.square(np.clip(result[CORE], 0, 1) - truth[CORE])[seen])

@@ -12,7 +12,6 @@ from turbrestore.core.decision import Decision
 from turbrestore.core.errors import require
 from turbrestore.io.images.image_files import write_map
 from turbrestore.io.output import check_output
-from turbrestore.io.pixels import check_depth
 from turbrestore.io.source import FrameSource
 from turbrestore.memory_plan import training_share
 from turbrestore.metrics import comparable
@@ -28,6 +27,7 @@ from .kept import check_room, kept_stages, own_outputs
 from .options import Machine, Selection
 from .output import (
     check_distinct,
+    check_image_depth,
     check_keep,
     repeating_command,
     save_stages,
@@ -89,8 +89,7 @@ class Order:
 
 def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
     """Restore one clip and write what was ordered; ``turbrestore batch`` calls this in every process."""
-    if order.bit_depth is not None:
-        check_depth(order.bit_depth)
+    check_image_depth(order.bit_depth, order.output)
     may_replace = _check_outputs(order)
     runtime = dataclasses.replace(order.machine.runtime(order.process_limit, order.keep), tile=order.tile)
     if order.truth is not None:

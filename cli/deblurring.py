@@ -18,22 +18,22 @@ from turbrestore.core.errors import ConfigurationError, InputNotFoundError, requ
 from turbrestore.core.gradient import sobel_gradient
 from turbrestore.core.remarks import counted
 from turbrestore.deblurring.guards import GuardParams, evaluate_guards
-from turbrestore.deblurring.remove_blur import SIGMAS_A_SIDE, remove_blur_steps
+from turbrestore.deblurring.remove_blur import remove_blur_steps
 from turbrestore.deconvolution.deconvolve import Deconvolution, DeconvolutionParams
 from turbrestore.deconvolution.deconvolve import deconvolve as deconvolve_image
+from turbrestore.deconvolution.problem import largest_width
 from turbrestore.display.figure import new_figure
 from turbrestore.display.maps import plot_images
 from turbrestore.io.images.image_files import read_image
 from turbrestore.io.limits import Limits
 from turbrestore.io.output import IMAGE_OUTPUT_SUFFIXES, check_output
-from turbrestore.io.pixels import check_depth
 from turbrestore.runs.stage_files import load_artifact
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.steps import finish, step_counter
 
 from .inputs import read_guide, read_input_image
 from .options import Flag, Machine, known_sigma, limits_of
-from .output import write_figure
+from .output import check_image_depth, write_figure
 from .progress import progress_bars, say
 from .stages import STAGE_FILE, write_stage
 
@@ -115,7 +115,7 @@ def deconvolve(
         deconvolution = _as_in_run(input, deconvolution)
     require(psf is None or deconvolution.sigma is None, "--psf: contradicts --sigma; leave one of them out")
     if bit_depth is not None:
-        check_depth(bit_depth)
+        check_image_depth(bit_depth, output)
         require(output.suffix.lower() not in STAGE_FILE, "--bit-depth: has no effect on a stage file; leave it out")
     inputs = [path for path in (source, guide, psf) if path is not None]
     check_output(output, inputs, overwrite, STAGE_FILE + tuple(IMAGE_OUTPUT_SUFFIXES))
@@ -171,7 +171,7 @@ def widths_of(sweep: str, shape: tuple[int, ...], name: str = "--sweep") -> tupl
         raise ConfigurationError(f"{name}: expected widths such as 1,1.4,2, found {sweep!r}") from None
     require(len(widths) <= MOST_WIDTHS, f"{name}: expected at most {MOST_WIDTHS} widths, found {len(widths)}")
     for width in widths:
-        require_between(name, width, 0, min(shape[:2]) / SIGMAS_A_SIDE, "pixels")
+        require_between(name, width, 0, largest_width(shape), "pixels")
     return widths
 
 

@@ -17,7 +17,7 @@ import tomli_w
 
 from turbrestore import __version__
 from turbrestore.core.arrays import FloatArray
-from turbrestore.core.errors import OutputError
+from turbrestore.core.errors import OutputError, require
 from turbrestore.io.astronomy.fits_header import is_fits
 from turbrestore.io.astronomy.fits_output import FITS_OUTPUT_SUFFIX, write_fits
 from turbrestore.io.images.image_files import write_image
@@ -180,6 +180,15 @@ def check_distinct(outputs: Iterable[Path]) -> None:
         if real in known:
             raise OutputError(f"{path}: is named for two outputs; choose another name for one of them")
         known.add(real)
+
+
+def check_image_depth(depth: int | None, output: Path | None = None) -> None:
+    """Refuse a depth that no image has, or not the one that is written."""
+    if depth is None:
+        return
+    require(depth in (8, 16, 32), f"--bit-depth: expected 8, 16 or 32, found {depth}")
+    is_png = output is not None and output.suffix.lower() == ".png"
+    require(not is_png or depth < 32, "--bit-depth: expected .tif or .fits for 32 bits, found .png")
 
 
 def check_keep(folder: Path | None, taken: list[Path], overwrite: bool, resume: bool) -> None:

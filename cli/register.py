@@ -19,7 +19,6 @@ from turbrestore.io.astronomy.fits_header import is_fits
 from turbrestore.io.astronomy.fits_output import FITS_OUTPUT_SUFFIX, write_fits_cube
 from turbrestore.io.npy import write_npz
 from turbrestore.io.output import atomic_output, atomic_write, check_output, check_space
-from turbrestore.io.pixels import check_depth
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
 from turbrestore.pipeline import restore
@@ -35,7 +34,7 @@ from turbrestore.stacking.registered import RegisteredFrame, registered_frames
 from .inputs import files_read, open_input
 from .kept import check_room, kept_stages
 from .options import Flag, Machine, Selection
-from .output import check_distinct, check_keep, save_stages, settings_record
+from .output import check_distinct, check_image_depth, check_keep, save_stages, settings_record
 from .progress import progress_bars, say
 
 # What a registered video is written as: lossless, with 16 bits or more.
@@ -102,8 +101,7 @@ def register(
     inputs = files_read(selection, input, config, params=params)
     _check_outputs(inputs, output, table, flows, overwrite)
     check_keep(keep, [*inputs, output, table, *([] if flows is None else [flows])], overwrite, resume)
-    if bit_depth is not None:
-        check_depth(bit_depth)
+    check_image_depth(bit_depth)
     runtime = machine.runtime(memory_limit, keep)
     source = open_input(input, selection, quiet)
     params = settings_of_known_flows(params, len(source))

@@ -63,7 +63,7 @@ def test_every_doubt_is_named_once_with_a_remedy(restoration):
         CheckKind.LARGE_MOTION: {"decisions": (Decision("motion", "", "9 pixels", CheckKind.LARGE_MOTION),)},
         CheckKind.SCENE_CHANGES: {"is_mean": True, "structure": StructureReading(0.05, 0.6, 0.2)},
         CheckKind.CONTRADICTION: {"is_mean": True, "structure": StructureReading(0.07, 0.2, 0.2)},
-        CheckKind.MOTION: {"structure": StructureReading(0.0, 0.6, 0.0)},
+        CheckKind.MOTION: {"structure": StructureReading(0.0, 0.9, 0.0)},
         CheckKind.REPETITION: {"mean": coarse.astype(np.float32)},
         CheckKind.FEW_FRAMES: {"filtered": only(restoration, 7)},
         CheckKind.GEOMETRY: {"dynamics": replace(restoration.dynamics, R=1600.0)},
@@ -88,6 +88,20 @@ def test_every_doubt_is_named_once_with_a_remedy(restoration):
         # Rings are no sharpness.
         assert ("times as sharp" in verdict.gained) == (kind not in (CheckKind.TOO_SHARP, *OF_THE_MEAN))
     assert f"{frames} frames" in restoration.verdict.gained
+
+
+def test_differences_are_no_motion_where_hardly_anything_moves(restoration):
+    for left, motion in ((0.6, 1.2), (0.9, 3.0), (0.2, 0.5), (1.0, np.inf)):
+        assert StructureReading(0.0, left).motion_left(1.0) == pytest.approx(motion, rel=0.05) or motion == np.inf
+    still = replace(restoration.centroid, flows=0.1 * restoration.centroid.flows)
+    changed = replace(restoration, centroid=still, structure=StructureReading(0.0, 0.9))
+    assert CheckKind.MOTION not in {check.kind for check in changed.verdict.checks}
+
+
+def test_too_few_of_the_frames_may_be_why_they_contradict_the_image(restoration):
+    changed = replace(restoration, is_mean=True, filtered=only(restoration, 7))
+    assert "leave out --keep-best" in str(changed.verdict)
+    assert "keep-best" not in str(replace(restoration, is_mean=True).verdict)
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,8 @@ from .core.arrays import FloatArray
 from .core.decision import Decision
 from .core.errors import require, settings_of
 from .core.noise import NoiseCurve, estimate_noise
-from .deblurring.remove_blur import SIGMAS_A_SIDE, Deblurred, find_blur, remove_blur_steps
-from .deconvolution.problem import read_blur
+from .deblurring.remove_blur import Deblurred, find_blur, remove_blur_steps
+from .deconvolution.problem import largest_width, read_blur
 from .dynamics.dynamic_texture import identify
 from .dynamics.flow_model import FlowDynamics
 from .evidence import Evidence, agreed_image, evidence_of_frames, measure_photon_noise, seeing_of_frames
@@ -373,7 +373,7 @@ def _unseen_share(run: Run, seen: FloatArray, part: tuple[slice, slice], train: 
 
 
 def _check_sigma(sigma: float | None, shape: tuple[int, ...]) -> None:
-    largest = min(shape[1:3]) / SIGMAS_A_SIDE
+    largest = largest_width(shape[1:3])
     require(
         sigma is None or sigma <= largest,
         f"sigma: expected at most {largest:g} pixels for frames of {shape[2]}×{shape[1]}, found {sigma}",

@@ -233,7 +233,9 @@ def _checks(restoration: Restoration, motion: float) -> Iterator[Check]:
     structure, filtered = restoration.structure, restoration.filtered
     if restoration.is_mean:
         changes = structure is not None and structure.unexplained_change
-        yield write_check(CheckKind.SCENE_CHANGES if changes else CheckKind.CONTRADICTION)
+        is_short = filtered is not None and not np.isfinite(filtered.sharpness).all()
+        remedy = "leave out --keep-best, or " if is_short else ""
+        yield write_check(CheckKind.SCENE_CHANGES if changes else CheckKind.CONTRADICTION, remedy)
     if restoration.unseen > _UNSEEN:
         yield write_check(CheckKind.UNSEEN, share_words(restoration.unseen))
     if restoration.is_mean or filtered is None or restoration.dynamics is None:
@@ -250,7 +252,8 @@ def _checks(restoration: Restoration, motion: float) -> Iterator[Check]:
         yield write_check(CheckKind.FEW_FRAMES, counted(kept, "frame"), error, FEW)
     elif error > _SEEN_BEND:
         yield write_check(CheckKind.GEOMETRY, error, counted(kept, "frame"))
-    if structure is not None and structure.left > _HALF:
+    # Where little moves, what is left of the differences is noise and compression.
+    if structure is not None and structure.left > _HALF and structure.motion_left(motion) > _SEEN_BEND:
         yield write_check(CheckKind.MOTION, structure.left)
     if (disputed := _disputed(restoration)) > MOSTLY:
         yield write_check(CheckKind.AGREEMENT, disputed)

@@ -44,7 +44,7 @@ _CHECKS = {
     ),
     CheckKind.CONTRADICTION: (
         "the frames contradict the filtered image, so their mean is the result",
-        "--frames FIRST:END with those that show one scene, or --roi X,Y,WIDTH,HEIGHT of a part that does not move",
+        "{0}--frames FIRST:END with those that show one scene, or --roi X,Y,WIDTH,HEIGHT of a part that does not move",
     ),
     CheckKind.REPETITION: (
         "the scene repeats every {0:.1f} pixels and moves by {1:.1f}, so parts may have slipped by one repetition",

@@ -8,6 +8,7 @@ import tifffile
 
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.footage.checks.content import check_content
+from turbrestore.io.axes import frames_are_last
 from turbrestore.io.images.image_files import read_image, read_pixels
 from turbrestore.io.pixels import upright
 from turbrestore.io.source import FrameSource
@@ -33,6 +34,13 @@ class TestArrays:
         last = FrameSource.from_array(np.ascontiguousarray(np.moveaxis(STILL, 0, -1)))
         assert last.shape == (40, 56, 14) and "np.moveaxis" in last.warnings[0]
         assert FrameSource.from_array(STILL).warnings == FrameSource.from_array(COLOUR).warnings == ()
+
+    def test_frames_of_an_object_that_jumps_stay_first(self):
+        rng, y, x = np.random.default_rng(4), *np.mgrid[:96, :128]
+        places = zip(rng.uniform(30, 98, 40), rng.uniform(30, 66, 40), strict=True)
+        frames = np.stack([np.hypot(x - u, y - v) < 20 for u, v in places]) + rng.normal(0, 0.02, (40, 96, 128))
+        assert not frames_are_last(frames)
+        assert frames_are_last(np.moveaxis(STILL, 0, -1))
 
     def test_large_arrays_are_not_copied_to_tell_their_axes(self):
         frames = np.zeros((20, 480, 640), np.float32)

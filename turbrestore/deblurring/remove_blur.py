@@ -22,7 +22,7 @@ from ..core.noise import NoiseCurve, estimate_noise
 from ..core.noise_spectrum import NoiseSpectrum, white_noise
 from ..deconvolution.deconvolve import Deconvolution, DeconvolutionParams, deconvolve_steps, whole_image_fidelity
 from ..deconvolution.memory import deconvolution_memory
-from ..deconvolution.problem import read_blur
+from ..deconvolution.problem import largest_width, read_blur
 from ..deconvolution.stopping import Steps
 from ..runtime.device import CPU, find_device
 from ..runtime.runtime import DEFAULT, Runtime
@@ -36,9 +36,8 @@ from .guards import BACK_OFF, GuardParams, GuardReading, evaluate_guards
 _BYTES, _CHANNEL_BYTES = 22, 2
 # Bytes per pixel and channel of the results of two attempts.
 _RESULTS_BYTES = 8
-# The widest blur that is found, pixels, and the least shorter side of an image in widths of its blur; both chosen:
-# a wider one leaves nothing to restore.
-WIDEST, SIGMAS_A_SIDE = 21.0, 8
+# The widest blur that is found, pixels, chosen: a wider one leaves nothing to restore.
+WIDEST = 21.0
 # Most attempts; if the last one fails, no blur is removed.
 _MOST_TRIES = 10
 # Shortest side that tiles may have, pixels.
@@ -216,7 +215,7 @@ def find_blur(
     evidence, posterior = estimate_posterior(grey, witnesses, noise, runtime, params.exponent)
     if evidence is None:
         return estimate_blur(image, exponent=params.exponent, runtime=runtime), posterior
-    widest = min(WIDEST, min(grey.shape) / SIGMAS_A_SIDE)
+    widest = min(WIDEST, largest_width(grey.shape))
     posterior = replace(posterior, removed=min(posterior.removed, widest))
     # No scene is steeper behind a Gaussian than a step.  A soft limb needs that bound; elsewhere it would take a blur
     # with wings, whose core is sharp, for a narrow one.

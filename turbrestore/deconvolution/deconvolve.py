@@ -40,7 +40,7 @@ from .nonlocal_prior.nonlocal_tv import PARALLEL_PIXELS, NonlocalPenalty
 from .nonlocal_prior.nonlocal_weights import NonlocalParams, nonlocal_weights
 from .nonlocal_prior.torch_nonlocal import torch_nonlocal_penalty
 from .primal_dual import Penalty, PrimalDual
-from .problem import Problem, margin_around, problem_of, read_blur
+from .problem import Problem, largest_width, margin_around, problem_of, read_blur
 from .stopping import Solution, Steps, iterate
 from .tv import LocalPenalty
 
@@ -213,7 +213,8 @@ def deconvolve(
     DataError
         Wrong shapes, values that are not finite or on another scale than 0 to 1, or an unusable PSF.
     ConfigurationError
-        The blur is not given, negative or not finite, or the memory of the device is not enough.
+        The blur is not given, negative, not finite or wider than an eighth of the shorter side, or the memory of the
+        device is not enough.
 
     Examples
     --------
@@ -226,6 +227,13 @@ def deconvolve(
     """
     pixels = check_unit_image(image)
     guide = None if guide is None else check_unit_image(guide, "guide")
+    width = settings_of(DeconvolutionParams, params).sigma if sigma_or_psf is None else sigma_or_psf
+    largest = largest_width(pixels.shape)
+    require(
+        not isinstance(width, float | int) or not width > largest,
+        f"sigma_or_psf: expected at most {largest:g} pixels for an image of {pixels.shape[1]}×{pixels.shape[0]}, "
+        f"found {width}",
+    )
     return finish(deconvolve_steps(pixels, sigma_or_psf, params, guide, runtime, spectrum=noise))
 
 

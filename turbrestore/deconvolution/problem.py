@@ -36,8 +36,9 @@ from ..core.noise import NoiseCurve
 from ..runtime.fourier import fast_length, irfft2, rfft2
 from ..runtime.image_stacks import Stack, load, namespace
 
-# Smallest margin, in widths of the blur.
-MARGIN_SIGMAS = 4.0
+# Smallest margin, in widths of the blur, and least shorter side of an image; the second chosen: a wider blur leaves
+# nothing to restore.
+MARGIN_SIGMAS, _SIGMAS_A_SIDE = 4.0, 8
 # Largest weight of a pixel, and the inverse of the least.
 _MOST_WEIGHT = 4.0
 # Transforms of smaller images are faster on one thread than on several.
@@ -147,6 +148,11 @@ def problem_of(
     """Problem of a plane (H, W); ``photons`` is its noise at every level, relative to the mean."""
     observed, seen = (load(image, otf.device) for image in (margin.pad(plane), margin.weights(plane, photons)))
     return Problem(observed, seen, otf, fidelity, threads)
+
+
+def largest_width(shape: tuple[int, ...]) -> float:
+    """Return the largest width of a blur that is removed from an image (H, W[, 3]), pixels."""
+    return min(shape[:2]) / _SIGMAS_A_SIDE
 
 
 def read_blur(sigma_or_psf: float | ArrayLike) -> tuple[NDArray[np.float64] | None, float, int]:

@@ -1,6 +1,8 @@
 """Order of the axes of an array: the frames of a video resemble each other more than its rows do.
 
-Light that changes makes rows of all frames alike, so planes along either axis are brought to the same level first.
+Light that changes makes rows of all frames alike, so planes along either axis are brought to the same level first.  An
+object that jumps makes frames unlike, but then the planes beside each other are unlike too, which rows of an image are
+not.
 """
 
 from __future__ import annotations
@@ -48,7 +50,24 @@ def frames_are_last(array: NDArray[Any], certain: bool = False) -> bool:
         block = block / np.maximum(level, np.finfo(float).tiny)
     # Square frames at the end make the first two axes, and no others, equally long.
     factor = 1.0 if shape[0] == shape[1] != shape[2] and not certain else _MORE_ALIKE
-    return _likeness(block, 2) > factor * _likeness(block, 0)
+    if _likeness(block, 2) <= factor * _likeness(block, 0):
+        return False
+    # Rows of 42 clips are 0.9 times as alike as columns or more, frames of an object that jumps 0.1 times.
+    return 2 * _beside(array, places, 0) > _beside(array, places, 1)
+
+
+def _beside(array: NDArray[Any], places: list[NDArray[np.int_]], axis: int) -> float:
+    """Mean correlation of planes beside each other along an axis."""
+    first = places[axis][places[axis] + 1 < array.shape[axis]]
+    one, other = (
+        np.moveaxis(array[np.ix_(*[chosen if k == axis else places[k] for k in range(3)])], axis, 0)
+        .reshape(len(first), -1)
+        .astype(np.float64)
+        for chosen in (first, first + 1)
+    )
+    one, other = (planes - planes.mean(axis=1, keepdims=True) for planes in (one, other))
+    norms = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
+    return float(((one * other).sum(axis=1) / np.maximum(norms, np.finfo(float).tiny)).mean())
 
 
 def _likeness(block: NDArray[np.float64], axis: int) -> float:

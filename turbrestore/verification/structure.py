@@ -76,6 +76,10 @@ class StructureReading:
         """Largest share of unseen edges, in inverse proportion to what registration leaves where that is little."""
         return UNSEEN * max(LEFT / max(self.left, ROUNDING), 1.0)
 
+    def motion_left(self, removed: float) -> float:
+        """Motion, pixels, that makes the differences that registration leaves, if ``removed`` made the others."""
+        return removed * float(np.sqrt(self.left / max(1 - self.left, ROUNDING)))
+
     @property
     def unexplained_change(self) -> bool:
         """Whether the scene itself changes, and registration leaves much of that."""

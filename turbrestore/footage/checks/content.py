@@ -336,7 +336,7 @@ class _ContentScan:
 
 def _in_words(report: ContentReport, repeated: bool) -> list[str]:
     if report.contrast == 0:
-        return ["every frame is of one intensity: there is no scene"]
+        return [Doubt("every frame is of one intensity: there is no scene")]
     lines = []
     if report.filled:
         where = numbers_text(report.filled)
