@@ -24,7 +24,6 @@ RARE = {
         "--threads",
         "--static-mask",
         "--reference",
-        "--like",
         "--derotate",
         "--axes",
     ),
@@ -32,7 +31,7 @@ RARE = {
     *("--channel-wavelengths", "--nyquist"),
 }
 # Options that few people need of a command with presets, and that are the point of others.
-RARE_IN_RESTORE = {"--pixel-scale", "--aperture", "--distance", "--wavelength", "--psf"}
+RARE_IN_RESTORE = {"--pixel-scale", "--aperture", "--distance", "--wavelength", "--psf", "--like"}
 # Columns for the names of options, and for the text if the terminal does not say.
 _NAMES, _WIDEST = 30, 110
 _ENDS = (". ", "; ", ": ", ", ", " (")

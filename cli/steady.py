@@ -157,14 +157,14 @@ def steady(
             moving = (image > 0 for image in _stored_masks(masks, source.shape[:2]))
             write_steady_report(report, (companion, open_frames(output)), moving, facts.figures, run, overwrite)
     if piped_out:
-        say(f"{source.name}: {facts.text()}", quiet)
+        say(f"{source.name} {facts.text()}", quiet)
         return
     write_settings(settings_path, settings_record(machine, selection, params, written))
     if json:
         paths = {"input": str(input), "output": str(output), "settings": str(settings_path)}
         print_json({**paths, **facts.record()})
     else:
-        say(f"{output}: {facts.text()}", quiet)
+        say(f"{output} {facts.text()}", quiet)
 
 
 def _check_printed(encoding: Encoding, json: bool, is_torn: bool, piped: bool) -> None:
@@ -305,7 +305,7 @@ class _Facts:
 
     def text(self) -> str:
         """One line for a person."""
-        return f"{self.figures.seconds:.1f} s: {self.figures.verdict}"
+        return f"({self.figures.seconds:.1f} s): {self.figures.verdict}"
 
 
 def _images(frames: Iterable[SteadyFrame], masks: BinaryIO | None) -> Iterator[FloatArray]:

@@ -19,7 +19,7 @@ from .core.verdict import Check, CheckKind, Verdict
 from .deblurring.guards import GuardReading
 from .deconvolution.deconvolve import Deconvolution
 from .display.maps import plot_images
-from .display.preview import preview
+from .display.preview import preview, summary
 from .dynamics.flow_model import FlowDynamics, mean_flow_error
 from .filtering.alternating import FilterCheckpoint, Filtered
 from .footage.levels import Levels
@@ -179,9 +179,7 @@ class Restoration:
         return plot_images({"mean": self.mean[self.shown], "result": self.image})
 
     def __repr__(self) -> str:
-        height, width = self.image.shape[:2]
-        lines = [f"Restoration: {width}×{height} pixels", *(f"{name}: {value}" for name, value in self._facts())]
-        return "\n".join([*lines, f"verdict: {self.verdict}"])
+        return summary("Restoration", [*self._facts(), ("verdict", str(self.verdict))], self.image.shape)
 
     def _repr_html_(self) -> str:
         choices = [(decision.subject, decision.choice) for decision in self.decisions]

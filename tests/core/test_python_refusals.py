@@ -56,6 +56,18 @@ WRONG = {
         lambda: tr.deconvolve(IMAGE, "1"),
         "sigma_or_psf: expected a finite number of 0 or more pixels, found '1'",
     ),
+    "width beyond the image": (
+        lambda: tr.deconvolve(IMAGE, 500.0),
+        "sigma_or_psf: expected at most the .* pixels of the longer side of the image, found 500.0",
+    ),
+    "a single frame": (
+        lambda: tr.estimate_flow(IMAGE, IMAGE),
+        r"frames: expected shape .*; write frame\[None\] for a single frame",
+    ),
+    "seed for a generator": (
+        lambda: tr.phase_screen_frames(IMAGE, 4, 0),
+        r"rng: expected Generator, found int; write np.random.default_rng\(0\)",
+    ),
     "settings of another stage": (
         lambda: tr.deconvolve(IMAGE, 1.0, tr.FlowParams()),
         r"params: expected DeconvolutionParams, found FlowParams; write DeconvolutionParams\(\.\.\.\)",

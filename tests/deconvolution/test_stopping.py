@@ -218,5 +218,5 @@ def test_half_of_a_small_image_is_measured_however_wide_the_blur(monkeypatch):
 
     monkeypatch.setattr("turbrestore.deconvolution.stopping.change_of", change)
     image = np.random.default_rng(0).random((16, 24), np.float32)
-    deconvolve(image, 40.0, DeconvolutionParams(method="tv", iterations=10))
+    deconvolve(image, 20.0, DeconvolutionParams(method="tv", iterations=10))
     assert [int(seen[0].max(axis=axis).sum()) for axis in (1, 0)] == [8, 16]

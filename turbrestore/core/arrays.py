@@ -77,7 +77,8 @@ def check_frames(frames: ArrayLike, at_least: int = 1) -> FloatArray:
     """
     array = _as_float(frames, "frames", "turbrestore.open_frames")
     if array.ndim not in (3, 4) or (array.ndim == 4 and array.shape[3] not in CHANNELS):
-        raise DataError(f"frames: expected shape (T, H, W) or (T, H, W, 3), found {array.shape}")
+        remedy = "; write frame[None] for a single frame" if array.ndim == 2 else ""
+        raise DataError(f"frames: expected shape (T, H, W) or (T, H, W, 3), found {array.shape}{remedy}")
     if len(array) < at_least:
         raise DataError(f"frames: expected at least {counted(at_least, 'frame')}, found {len(array)}")
     return _finite(array, "frames", "; clean_source(source, check_content(source)) fills them")

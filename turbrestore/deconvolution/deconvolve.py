@@ -29,7 +29,7 @@ from ..core.errors import ConfigurationError, DataError, require, require_betwee
 from ..core.noise import NoiseCurve, estimate_noise
 from ..core.noise_spectrum import NoiseSpectrum
 from ..display.curves import plot_objective
-from ..display.preview import preview
+from ..display.preview import preview, summary
 from ..runtime.device import find_device, memory_of
 from ..runtime.image_stacks import Stack, load, store
 from ..runtime.runtime import DEFAULT, Runtime
@@ -40,7 +40,7 @@ from .nonlocal_prior.nonlocal_tv import PARALLEL_PIXELS, NonlocalPenalty
 from .nonlocal_prior.nonlocal_weights import NonlocalParams, nonlocal_weights
 from .nonlocal_prior.torch_nonlocal import torch_nonlocal_penalty
 from .primal_dual import Penalty, PrimalDual
-from .problem import Problem, largest_width, margin_around, problem_of, read_blur
+from .problem import Problem, margin_around, problem_of, read_blur
 from .stopping import Solution, Steps, iterate
 from .tv import LocalPenalty
 
@@ -166,13 +166,18 @@ class Deconvolution:
         """
         return plot_objective(self.recorded, self.objective)
 
+    def __repr__(self) -> str:
+        return summary("Deconvolution", self._facts(), self.image.shape)
+
     def _repr_html_(self) -> str:
-        facts = [
+        return preview("Deblurred image", self._facts(), self.image)
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [
             ("blur removed", f"{self.sigma:.2f} pixels" if self.sigma > 0 else "none"),
             ("noise at half frequency", f"{100 * self.noise:.2f} % of full scale, if it were white"),
             ("iterations", f"{self.iterations}, {'' if self.converged else 'not '}converged"),
         ]
-        return preview("Deblurred image", facts, self.image)
 
 
 def deconvolve(
@@ -213,8 +218,7 @@ def deconvolve(
     DataError
         Wrong shapes, values that are not finite or on another scale than 0 to 1, or an unusable PSF.
     ConfigurationError
-        The blur is not given, negative, not finite or wider than an eighth of the shorter side, or the memory of the
-        device is not enough.
+        The blur is not given, negative, not finite or wider than the image, or the memory of the device is not enough.
 
     Examples
     --------
@@ -228,11 +232,10 @@ def deconvolve(
     pixels = check_unit_image(image)
     guide = None if guide is None else check_unit_image(guide, "guide")
     width = settings_of(DeconvolutionParams, params).sigma if sigma_or_psf is None else sigma_or_psf
-    largest = largest_width(pixels.shape)
+    longest = max(pixels.shape[:2])
     require(
-        not isinstance(width, float | int) or not width > largest,
-        f"sigma_or_psf: expected at most {largest:g} pixels for an image of {pixels.shape[1]}×{pixels.shape[0]}, "
-        f"found {width}",
+        not isinstance(width, float | int) or not width > longest,
+        f"sigma_or_psf: expected at most the {longest} pixels of the longer side of the image, found {width}",
     )
     return finish(deconvolve_steps(pixels, sigma_or_psf, params, guide, runtime, spectrum=noise))
 

@@ -54,6 +54,11 @@ def shrink(image: FloatArray, longest: int) -> FloatArray:
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 
 
+def summary(title: str, facts: Iterable[tuple[str, str]], shape: tuple[int, ...]) -> str:
+    """Write size and key figures of an image (H, W[, 3]), a line each, as an interpreter prints a result."""
+    return "\n".join([f"{title}: {shape[1]}×{shape[0]} pixels", *(f"{name}: {value}" for name, value in facts)])
+
+
 def preview(title: str, facts: Iterable[tuple[str, str]], image: FloatArray | None = None) -> str:
     """Make a small HTML card for notebooks: a thumbnail beside key figures.
 

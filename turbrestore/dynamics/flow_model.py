@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..core.arrays import PART, ROUNDING, FloatArray
 from ..core.errors import DataError
-from ..display.preview import preview
+from ..display.preview import preview, summary
 from ..display.spectra import plot_dynamics
 from ..runtime.jit import jit
 from ..runtime.scratch import iter_parts, iter_slices
@@ -87,9 +87,7 @@ class FlowDynamics:
         return plot_dynamics(self.singular_values, self.eigenvalues)
 
     def __repr__(self) -> str:
-        height, width = self.shape
-        facts = [*self._facts(), *(("note", note) for note in self.notes)]
-        return "\n".join([f"FlowDynamics: {width}×{height} pixels", *(f"{name}: {value}" for name, value in facts)])
+        return summary("FlowDynamics", [*self._facts(), *(("note", note) for note in self.notes)], self.shape)
 
     def _repr_html_(self) -> str:
         spread = np.sqrt(self.flow_variance).astype(np.float32)

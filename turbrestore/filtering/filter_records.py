@@ -13,7 +13,7 @@ import numpy as np
 from ..core.arrays import FloatArray
 from ..core.errors import require, require_between
 from ..display.curves import plot_frames
-from ..display.preview import preview
+from ..display.preview import preview, summary
 from ..registration.recentring import recentring_flow
 from ..registration.warp import warp
 from .estimates import Gaussian, PixelGaussian
@@ -192,13 +192,18 @@ class Filtered:
         """
         return plot_frames(self.sharpness, self.shares)
 
+    def __repr__(self) -> str:
+        return summary("Filtered", self._facts(), self.image.shape)
+
     def _repr_html_(self) -> str:
-        facts = [
+        return preview("Filtered image", self._facts(), self.image)
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [
             ("frames", str(self.gains.size)),
             ("innovation", f"{np.nanmean(self.innovations):.2f} pixels"),
             ("noise of a frame", f"{100 * self.image_noise**0.5:.2f} % of full scale"),
         ]
-        return preview("Filtered image", facts, self.image)
 
 
 def filter_memory(shape: tuple[int, ...], train: int, params: FilterParams | None = None, threads: int = 1) -> float:

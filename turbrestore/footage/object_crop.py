@@ -90,7 +90,8 @@ def crop_to_object(source: FrameSource) -> FrameSource:
     places = {number: find_object(frame) for number, frame in zip(source.numbers, _shown(source), strict=True)}
     whole = {number: place for number, place in places.items() if place is not None and not place.cut}
     if not whole:
-        raise DataError(f"{source.name}: expected a bright object within the frames, found none; leave the crop out")
+        remedy = "leave out --crop-to-object"
+        raise DataError(f"{source.name}: expected a bright object within the frames, found none; {remedy}")
     height, width = source.shape[1:3]
     sizes = [(place.height, place.width) for place in whole.values()]
     # A frame or two that is torn, or crossed by an aeroplane, does not set the size.

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 from ..core.arrays import ROUNDING, FloatArray, check_frames, check_unit_frames, luminance
 from ..core.errors import require, require_between, settings_of
 from ..display.maps import plot_displacements
-from ..display.preview import preview
+from ..display.preview import preview, summary
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.scratch import drop_pages, iter_frames, mean_of, new_stack
 from ..runtime.steps import finish
@@ -123,13 +123,18 @@ class Centroid:
         """Draw how far every pixel moves over the frames; ConfigurationError without Matplotlib."""
         return plot_displacements(self.flows, self.image)
 
+    def __repr__(self) -> str:
+        return summary("Centroid", self._facts(), self.image.shape)
+
     def _repr_html_(self) -> str:
-        facts = [
+        return preview("Centroid", self._facts(), self.image)
+
+    def _facts(self) -> list[tuple[str, str]]:
+        return [
             ("frames", str(len(self.flows))),
             ("mean flow left", f"{self.mean_flow_sizes[-1]:.2f} pixels"),
             ("iterations", f"{self.mean_flow_sizes.size}, {'' if self.converged else 'not '}converged"),
         ]
-        return preview("Centroid", facts, self.image)
 
 
 @dataclass(frozen=True)

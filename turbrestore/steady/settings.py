@@ -26,11 +26,11 @@ class SteadyParams:
     reach : int
         Distance of the furthest neighbours of a frame, frames: the delay of a stream.
     live : bool
-        Give every frame before more than two others have been read: neighbours after a frame are at most two frames
-        away, and no blur is removed until it has been estimated.
+        Lag two frames behind the input instead of ``reach``.  Neighbours after a frame are at most two frames away, and
+        no blur is removed until it has been estimated.
     largest : float, optional
-        What turbulence displaces at most, pixels; larger ones count as motion and are kept.  By default it is
-        measured while the camera is static or locked, and 1 while it moves.
+        Largest displacement by turbulence, pixels; larger ones count as motion and are kept.  By default it is measured
+        while the camera is static or locked, and 1 while it shakes.
 
     Raises
     ------

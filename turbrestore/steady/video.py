@@ -27,6 +27,7 @@ from ..core.arrays import FloatArray, luminance
 from ..core.errors import settings_of
 from ..core.noise import estimate_noise
 from ..core.noise_spectrum import white_noise
+from ..display.preview import summary
 from ..footage.overlays import Title, find_title
 from ..footage.survey import take_survey
 from ..io.source import FrameSource
@@ -80,6 +81,10 @@ class SteadyFrame:
     sigma: float
     starts_scene: bool
     replaced: float
+
+    def __repr__(self) -> str:
+        removed = f"{self.displacement:.2f} pixels of motion, {self.sigma:.2f} of blur"
+        return summary("SteadyFrame", [("number", str(self.number)), ("removed", removed)], self.image.shape)
 
 
 def steady_frames(

@@ -35,7 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from ..core.arrays import FloatArray
-from ..core.errors import require
+from ..core.errors import require, require_type
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import map_ahead, one_thread_each
 from .atmosphere import PhaseScreenParams
@@ -108,6 +108,7 @@ def phase_screen_frames(
     """
     params, camera = params or PhaseScreenParams(), camera or CameraParams()
     truth = check_scene(scene)
+    require_type("rng", rng, np.random.Generator, "write np.random.default_rng(0)")
     require(count >= 1, f"count: expected at least 1 frame, found {count}")
     return _frames(truth, count, rng, params, camera, runtime, tuple(objects))
 

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_image, from_unit
 from ..core.errors import DataError, require, require_between
+from ..display.preview import summary
 from ..registration.flow import MIN_SIDE
 from ..registration.flow_algebra import invert_flow
 from ..registration.warp import warp
@@ -38,6 +39,10 @@ class SyntheticFrame:
 
     image: FloatArray
     flow: FloatArray
+
+    def __repr__(self) -> str:
+        size = np.sqrt(2 * np.mean(np.square(self.flow), dtype=np.float64))
+        return summary("SyntheticFrame", [("motion", f"{size:.2f} pixels")], self.image.shape)
 
 
 @dataclass(frozen=True)
