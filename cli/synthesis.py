@@ -211,7 +211,7 @@ def _training_frames(like: Path | None, train: int | None, limits: Limits) -> Fl
 def _with_strength(path: PhaseScreenParams, strength: str | None) -> PhaseScreenParams:
     if strength is None:
         return path
-    given = [name for name in ("cn2", "r0", "d_over_r0") if getattr(path, name) is not None]
+    given = [f"--{name.replace('_', '-')}" for name in ("cn2", "r0", "d_over_r0") if getattr(path, name) is not None]
     require(not given, f"--strength: contradicts {', '.join(given)}; leave one of them out")
     return dataclasses.replace(path, d_over_r0=STRENGTHS[strength])
 

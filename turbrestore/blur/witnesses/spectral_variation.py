@@ -34,11 +34,11 @@ from ..psf import Float64Array
 SIDE, _BORDER = 64, 16
 # Most windows along an axis, and most frames.
 _WINDOWS, _FRAMES = 5, 48
-# Fewest frames that are compared.
+# Fewest frames that are compared, chosen.
 _FEWEST = 4
-# Frames by whose flows white noise is warped, and highest rings, at which no signal is left.
+# Frames by whose flows white noise is warped, and highest rings, at which no signal is left; both chosen.
 _NOISE_FRAMES, _NOISE_RINGS = 4, 4
-# Least power of the noise: a standard deviation of 10⁻⁴ under the window.
+# Least power of the noise: a standard deviation of 10⁻⁴ under the window, about what rounding to 12 bits leaves.
 _LEAST_NOISE = 1e-8 * SIDE**2 * 9 / 64
 # Frequencies of the rings, cycles per pixel.
 RINGS: Float64Array = np.arange(SIDE // 2 + 1) / SIDE

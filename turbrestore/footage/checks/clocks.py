@@ -25,11 +25,12 @@ _LEAST_SAME, _OFTEN, _REMAINS, FEWEST_STROKES = 1.5, 0.2, 0.25, 12
 _TIMES, _USUAL, _ALMOST_USUAL = 2, 0.15, 1.5
 # Largest part of the frame that digits take.
 _MOST_DIGITS = 0.1
-# Distance from other strokes, pixels, within which a stroke may stay in fewer frames, and the least share of them.
+# Distance from other strokes, pixels, within which a stroke may stay in fewer frames, and the least share of them;
+# both chosen.
 BESIDE, _REMAINS_BESIDE = 8, 0.18
-# Largest distance of digits from an overlay: the height of the frame over this.
+# Largest distance of digits from an overlay: the height of the frame over this, chosen.
 LINE = 10
-# Radius of the gaps between strokes, pixels.
+# Radius of the gaps between strokes, pixels, chosen.
 _GAP = 2
 
 
