@@ -209,7 +209,7 @@ def pixel(folder):
         ("chart", ["--cn2", "-1e-15"], 2, "cn2: expected a positive number"),
         ("chart", ["--aperture", "0"], 2, "aperture"),
         ("chart", ["--exposure", "0.05"], 2, "exposure: expected 0 to the frame time"),
-        ("chart", ["--strength", "weak", "--r0", "0.05"], 2, "--strength: contradicts r0"),
+        ("chart", ["--strength", "weak", "--r0", "0.05"], 2, "--strength: contradicts --r0"),
         ("chart", ["--wind", "1", "--wind", "2"], 2, "wind: expected one value"),
         ("chart", ["--frames", "1000000000"], 2, "--frames"),
         ("chart", ["--size", "8x8"], 2, "at least 64"),
