@@ -1,7 +1,8 @@
 """Gain of steadied video: own clips of the kinds that people film, and cameras that move.
 
-Town, traffic, sports, façades and foliage are filmed through phase screens of D/r0 1 to 4 and compressed with H.264.
-The camera turns, so that the air of a wide scene stays where it is while the camera moves; objects move in the scene.
+Town, traffic, sports, façades, lattices and foliage are filmed through phase screens of D/r0 1 to 4 and compressed with
+H.264. The camera turns, so that the air of a wide scene stays where it is while the camera moves; objects move in the
+scene.
 Cameras that stand, creep, pan, stop, nod, zoom and shake film photographs through smooth displacements, without blur,
 which show how far the picture lies from its place.  Settings are chosen on the clips of ``chosen``; those of
 ``reported`` have other pictures, air, paths and periods.
@@ -268,8 +269,8 @@ COLUMNS = (
 )
 NOTE = """
 Flicker is the mean change from frame to frame over that of the truth, where the truth changes.  Shift is the distance
-from the truth that 90 % of the frames keep, of façades that 90 % of their tiles keep.  `restore` makes one image of all
-frames, which is compared with the frames from 60 on.
+from the truth that 90 % of the frames keep, of façades and lattices that 90 % of their tiles keep; of patterns that
+repeat it may be many periods.  `restore` makes one image of all frames, which is compared with the frames from 60 on.
 """
 
 

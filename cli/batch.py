@@ -41,7 +41,7 @@ from .clip import Order, restore_clip
 from .cluster import check_cluster, connected
 from .inputs import with_absolute_paths
 from .options import Flag, Machine, Selection, known_sigma
-from .output import print_json
+from .output import check_output_depth, print_json
 from .progress import progress_bars, say
 
 if TYPE_CHECKING:
@@ -123,6 +123,7 @@ def batch(
         out.is_dir() or out.suffix.lower() not in IMAGE_OUTPUT_SUFFIXES,
         f"{out}: expected a folder for the results, found the name of an image; restore writes one image",
     )
+    check_output_depth(bit_depth, f".{format}")
     clips = find_clips(inputs)
     outputs = name_outputs(clips, out, f".{format}")
     count = 1 if scheduler or not parallel else processes(len(clips), memory_limit, workers)

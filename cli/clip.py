@@ -27,8 +27,8 @@ from .kept import check_room, kept_stages, own_outputs
 from .options import Machine, Selection
 from .output import (
     check_distinct,
-    check_image_depth,
     check_keep,
+    check_output_depth,
     repeating_command,
     save_stages,
     settings_record,
@@ -89,7 +89,7 @@ class Order:
 
 def restore_clip(order: Order) -> tuple[Restoration, FrameSource]:
     """Restore one clip and write what was ordered; ``turbrestore batch`` calls this in every process."""
-    check_image_depth(order.bit_depth, order.output)
+    check_output_depth(order.bit_depth, order.output.suffix)
     may_replace = _check_outputs(order)
     runtime = dataclasses.replace(order.machine.runtime(order.process_limit, order.keep), tile=order.tile)
     if order.truth is not None:

@@ -16,7 +16,7 @@ from turbrestore.io.output import atomic_write, check_output
 from turbrestore.settings import Preset, RestoreParams
 
 from .options import Flag, known_sigma
-from .output import check_image_depth
+from .output import check_output_depth
 from .settings import preset_settings, read_toml, settings
 from .streams import put
 
@@ -113,7 +113,7 @@ def _changes(app: App, path: Path) -> list[str]:
     if "selection" in given:
         given["selection"].frame_range()
         given["selection"].region()
-    check_image_depth(given.get("bit_depth"))
+    check_output_depth(given.get("bit_depth"))
     params = given.get("params", RestoreParams())
     known_sigma(given.get("sigma"), params.deconvolution)
     defaults = {key: argument.field_info.default for key, argument in _settings(app).items()}

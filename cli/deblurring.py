@@ -33,7 +33,7 @@ from turbrestore.runtime.steps import finish, step_counter
 
 from .inputs import read_guide, read_input_image
 from .options import Flag, Machine, known_sigma, limits_of
-from .output import check_image_depth, write_figure
+from .output import check_output_depth, write_figure
 from .progress import progress_bars, say
 from .stages import STAGE_FILE, write_stage
 
@@ -115,12 +115,13 @@ def deconvolve(
         deconvolution = _as_in_run(input, deconvolution)
     require(psf is None or deconvolution.sigma is None, "--psf: contradicts --sigma; leave one of them out")
     if bit_depth is not None:
-        check_image_depth(bit_depth, output)
+        check_output_depth(bit_depth, output.suffix)
         require(output.suffix.lower() not in STAGE_FILE, "--bit-depth: has no effect on a stage file; leave it out")
     inputs = [path for path in (source, guide, psf) if path is not None]
     check_output(output, inputs, overwrite, STAGE_FILE + tuple(IMAGE_OUTPUT_SUFFIXES))
     limits = limits_of(max_pixels)
     image, guide_image = _read(source, guide, limits)
+    require_between("--sigma", deconvolution.sigma or 0.0, 0, largest_width(image.shape), "pixels")
     kernel = None if psf is None else psf_from_image(read_input_image(psf, limits), str(psf))
     with progress_bars(quiet) as progress:
         steps = remove_blur_steps(image, guide_image, deconvolution, guards, machine.runtime(), psf=kernel)

@@ -182,13 +182,13 @@ def check_distinct(outputs: Iterable[Path]) -> None:
         known.add(real)
 
 
-def check_image_depth(depth: int | None, output: Path | None = None) -> None:
-    """Refuse a depth that no image has, or not the one that is written."""
+def check_output_depth(depth: int | None, suffix: str = "") -> None:
+    """Refuse a depth that no output has, or not the one of this suffix."""
     if depth is None:
         return
     require(depth in (8, 16, 32), f"--bit-depth: expected 8, 16 or 32, found {depth}")
-    is_png = output is not None and output.suffix.lower() == ".png"
-    require(not is_png or depth < 32, "--bit-depth: expected .tif or .fits for 32 bits, found .png")
+    holds = suffix.lower() not in (".png", ".ser", ".mkv")
+    require(holds or depth < 32, f"--bit-depth: expected TIFF or FITS for 32 bits, found {suffix}")
 
 
 def check_keep(folder: Path | None, taken: list[Path], overwrite: bool, resume: bool) -> None:

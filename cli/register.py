@@ -34,7 +34,7 @@ from turbrestore.stacking.registered import RegisteredFrame, registered_frames
 from .inputs import files_read, open_input
 from .kept import check_room, kept_stages
 from .options import Flag, Machine, Selection
-from .output import check_distinct, check_image_depth, check_keep, save_stages, settings_record
+from .output import check_distinct, check_keep, check_output_depth, save_stages, settings_record
 from .progress import progress_bars, say
 
 # What a registered video is written as: lossless, with 16 bits or more.
@@ -101,7 +101,7 @@ def register(
     inputs = files_read(selection, input, config, params=params)
     _check_outputs(inputs, output, table, flows, overwrite)
     check_keep(keep, [*inputs, output, table, *([] if flows is None else [flows])], overwrite, resume)
-    check_image_depth(bit_depth)
+    check_output_depth(bit_depth, output.suffix)
     runtime = machine.runtime(memory_limit, keep)
     source = open_input(input, selection, quiet)
     params = settings_of_known_flows(params, len(source))

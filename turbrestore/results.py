@@ -125,6 +125,8 @@ class Restoration:
         Whether moving objects were replaced by the background.
     unseen : float
         Share of the image that hardly any frame shows.
+    keep_best : float
+        Share of the frames that was asked for.
     """
 
     image: FloatArray
@@ -150,6 +152,7 @@ class Restoration:
     is_mean: bool = False
     objects_replaced: bool = False
     unseen: float = 0.0
+    keep_best: float = 1.0
 
     @property
     def motion(self) -> float:
@@ -231,8 +234,7 @@ def _checks(restoration: Restoration, motion: float) -> Iterator[Check]:
     structure, filtered = restoration.structure, restoration.filtered
     if restoration.is_mean:
         changes = structure is not None and structure.unexplained_change
-        is_short = filtered is not None and not np.isfinite(filtered.sharpness).all()
-        remedy = "leave out --keep-best, or " if is_short else ""
+        remedy = "leave out --keep-best, or " if restoration.keep_best < 1 else ""
         yield write_check(CheckKind.SCENE_CHANGES if changes else CheckKind.CONTRADICTION, remedy)
     if restoration.unseen > _UNSEEN:
         yield write_check(CheckKind.UNSEEN, share_words(restoration.unseen))

@@ -18,6 +18,8 @@ from ..job import one_line
 _LABELS = {
     "pass overwrite=True": "tick Replace existing files",
     "leave out --sigma": "press As measured",
+    "leave out --keep-best": "set Keep best to 100 %",
+    "leave out --crop-to-object": "untick Follow a bright object on a dark field",
     "with --roi": "by Region",
     "--roi X,Y,WIDTH,HEIGHT of": "under Region, choose",
     "--roi X,Y,WIDTH,HEIGHT": "Region",

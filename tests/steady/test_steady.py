@@ -13,7 +13,7 @@ from turbrestore.blur.posterior import BlurWitnesses
 from turbrestore.core.errors import DataError
 from turbrestore.core.noise_spectrum import white_noise
 from turbrestore.runtime.runtime import Runtime
-from turbrestore.steady.dewarping import measure_flow
+from turbrestore.steady.dewarping import dewarp_frame, measure_flow
 from turbrestore.steady.memory import Memory, remember
 from turbrestore.steady.settings import SteadyParams
 from turbrestore.steady.video import WindowWitnesses, _find_blur, _find_witnesses, _Scenes, steady_frames
@@ -218,6 +218,18 @@ def test_neither_objects_nor_the_camera_add_to_the_displacement_by_the_air(case)
         return _find_witnesses(window, truth[6]).usual
 
     assert usual(0.004 * (case != "object"), case != "zoom") == pytest.approx(usual(0, False), rel=0.5)
+
+
+def test_strong_air_that_moves_whole_frames_is_no_shake():
+    places = np.random.default_rng(5).normal(0, 2.0, (25, 2))
+    scene = photo(size=SIZE + 48)
+    truth = [cv2.warpAffine(scene, np.float64([[1, 0, x - 24], [0, 1, y - 24]]), (SIZE, SIZE)) for x, y in places]
+    found = [
+        dewarp_frame(list(iter_windows(shaken(truth, rms=rms), SteadyParams().distances))[12], SteadyParams())
+        for rms in (0.1, 3.0)
+    ]
+    assert [frame.steadiness > 0.5 for frame in found] == [False, True]
+    assert found[0].largest < 2 and found[1].largest > 4
 
 
 @pytest.fixture(scope="module")

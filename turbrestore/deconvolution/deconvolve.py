@@ -218,7 +218,8 @@ def deconvolve(
     DataError
         Wrong shapes, values that are not finite or on another scale than 0 to 1, or an unusable PSF.
     ConfigurationError
-        The blur is not given, negative, not finite or wider than the image, or the memory of the device is not enough.
+        The blur is not given, negative, not finite or wider than the longer side of the image, or the memory of the
+        device is not enough.
 
     Examples
     --------
@@ -231,12 +232,6 @@ def deconvolve(
     """
     pixels = check_unit_image(image)
     guide = None if guide is None else check_unit_image(guide, "guide")
-    width = settings_of(DeconvolutionParams, params).sigma if sigma_or_psf is None else sigma_or_psf
-    longest = max(pixels.shape[:2])
-    require(
-        not isinstance(width, float | int) or not width > longest,
-        f"sigma_or_psf: expected at most the {longest} pixels of the longer side of the image, found {width}",
-    )
     return finish(deconvolve_steps(pixels, sigma_or_psf, params, guide, runtime, spectrum=noise))
 
 
@@ -265,6 +260,11 @@ def deconvolve_steps(
         params = dataclasses.replace(params, exponent=params.exponent or sigma_or_psf.exponent)
         sigma_or_psf = sigma_or_psf.removable
     psf, sigma, reach = read_blur(sigma_or_psf)
+    longest = max(pixels.shape[:2])
+    require(
+        psf is not None or sigma <= longest,
+        f"sigma_or_psf: expected at most the {longest} pixels of the longer side of the image, found {sigma:g}",
+    )
     planes = split_planes(pixels, params.channels)
     noise, fidelity = _noise_and_fidelity(planes, params, sigma, spectrum)
     if sigma == 0:

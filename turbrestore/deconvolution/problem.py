@@ -151,7 +151,7 @@ def problem_of(
 
 
 def largest_width(shape: tuple[int, ...]) -> float:
-    """Return the largest width of a blur that is removed from an image (H, W[, 3]), pixels."""
+    """Return the largest width of a blur that commands remove from an image (H, W[, 3]), pixels."""
     return min(shape[:2]) / _SIGMAS_A_SIDE
 
 

@@ -62,6 +62,5 @@ def only_counted(frames: Iterable[FloatArray], counted: NDArray[np.bool_]) -> It
 
 def check_share(share: float) -> None:
     """Raise ConfigurationError unless the fraction of frames to keep is above 0 and at most 1."""
-    percent = f"; write {share / 100:g}" if 2 <= share <= 100 else ""
-    found = f"{share:g}" if percent or share <= 0 else f"{share:g}, which is {100 * share:g}%"
-    require(0 < share <= 1, f"keep_best: expected a share above 0 and up to 1, or 1% to 100%, found {found}{percent}")
+    remedy = f"; write {share / 100:g}" if 2 <= share <= 100 else "; write 1 for all" if 1 < share < 2 else ""
+    require(0 < share <= 1, f"keep_best: expected a share above 0 and up to 1, or 1% to 100%, found {share:g}{remedy}")

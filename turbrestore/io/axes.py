@@ -52,7 +52,8 @@ def frames_are_last(array: NDArray[Any], certain: bool = False) -> bool:
     factor = 1.0 if shape[0] == shape[1] != shape[2] and not certain else _MORE_ALIKE
     if _likeness(block, 2) <= factor * _likeness(block, 0):
         return False
-    # Rows of 42 clips are 0.9 times as alike as columns or more, frames of an object that jumps 0.1 times.
+    # In 42 clips neighbouring rows are at least 0.9 times as alike as neighbouring columns; frames of an object that
+    # jumps are 0.1 to 0.2 times as alike as its rows.
     return 2 * _beside(array, places, 0) > _beside(array, places, 1)
 
 

@@ -127,8 +127,7 @@ def open_npy(path: Path, limits: Limits = DEFAULT_LIMITS, axes: str | None = Non
     whole = map_npy(path)
     array, order = _frames_first(path, whole) if axes is None else (_named_order(path, whole, axes), "")
     usual = "--axes thw" if whole.ndim == 3 else "--axes thwc"
-    remark = Doubt(f"its axes are taken for {order}, {_size(array)}; {usual} reads {_size(whole)}")
-    notes = (remark,) if order else ()
+    notes = (Doubt(f"its axes are taken for {order}, {_size(array)}; {usual} reads {_size(whole)}"),) if order else ()
     return source_of_numbers(
         path, f"npy/{array.dtype}", array.shape, array.dtype, MappedFrames.of(array), notes, limits
     )

@@ -30,8 +30,8 @@ class MemorySize(float):
             meant = f"; did you mean {digits}{_SPELT[close[0]]}?" if digits and close else ""
             raise ConfigurationError(f"{expected}, found {value!r}{meant}") from None
         require(0 < size < float("inf"), f"{expected}, found {value!r}")
-        # Nobody who writes a small number without a unit means bytes.
-        is_short = isinstance(value, str) and unit == "" and size < _UNITS["mb"]
+        # Nobody who writes a few bytes means bytes.
+        is_short = isinstance(value, str) and unit == "" and size < _UNITS["kb"]
         require(not is_short, f"{expected}, found {value!r}; did you mean {text}GB?")
         return super().__new__(cls, size)
 

@@ -92,7 +92,7 @@ def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
     if flows:
         sizes = displacement_sizes(own)
         size = float(np.mean(sizes))
-        # At the ends of a scene the motion of the camera does not cancel, and counts as shake.
+        # At the ends of a scene |S_1| has one side only, where motion does not cancel, and says nothing of the air.
         whole = whole_displacement(sizes[0]) if {-1, 1} <= flows.keys() else 0.0
         steadiness = camera_steadiness({} if params.camera == "lock" else cameras, shape, whole)
         largest = params.largest or largest_displacement(size, steadiness)

@@ -21,7 +21,7 @@ counts less where something moves.  The ½ is the share of the frame itself, who
 
 Curved motion and turbulence cannot be told apart in a few frames.  While the camera is static, so is most of a scene,
 and c follows the median of |S_i| between 1 and 8 pixels; while it shakes, c is 1 pixel.  Strong turbulence moves whole
-frames too, which is no shake: how far tells |S_1|, since flows to the nearest frames do not fail while a camera shakes.
+frames too, which is no shake: |S_1| tells how far, since flows to the nearest frames do not fail while a camera shakes.
 
 What moves
 ----------
@@ -113,7 +113,7 @@ def expected_motion(cameras: Mapping[int, Matrix], offset: int) -> Matrix:
 
 
 def camera_steadiness(cameras: Mapping[int, Matrix], shape: tuple[int, ...], whole: float) -> float:
-    """Tell whether the camera moves at constant velocity within the window, but for what turbulence moves it.
+    """Tell whether the camera moves at constant velocity within the window, apart from what turbulence makes of it.
 
     ``cameras`` (2, 3); turbulence moves whole frames by ``whole`` pixels.
     """

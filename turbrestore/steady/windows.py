@@ -132,14 +132,14 @@ def relit(image: FloatArray, gain: FloatArray) -> FloatArray:
     # Rows as they lie in memory: NumPy is slow along an axis of three.
     rows = image.reshape(len(image), -1)
     factor = np.broadcast_to(np.exp(gain), image.shape[1:]).ravel()
-    white = np.clip(rows, 0, 1)
+    scaled = np.clip(rows, 0, 1)
     for _ in range(_WHITE_SQUARED):
-        white *= white
-    white *= factor - 1
-    white += 1
-    np.divide(factor, white, out=white)
-    white *= rows
-    return white.reshape(image.shape)
+        scaled *= scaled
+    scaled *= factor - 1
+    scaled += 1
+    np.divide(factor, scaled, out=scaled)
+    scaled *= rows
+    return scaled.reshape(image.shape)
 
 
 def _normalised(grey: FloatArray, shape: tuple[int, ...]) -> GreyImage:

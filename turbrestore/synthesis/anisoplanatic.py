@@ -96,7 +96,7 @@ def phase_screen_frames(
     DataError
         The scene is too small, of one colour, or not in [0, 1].
     ConfigurationError
-        ``count`` is not positive.
+        ``count`` is not positive, or ``rng`` is no generator.
 
     Examples
     --------
