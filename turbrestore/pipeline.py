@@ -196,7 +196,7 @@ def _fuse(run: Run) -> tuple[Restoration, Evidence]:
         frame_count=len(training) if filtered is None else len(source),
         seconds=run.seconds,
         seeing=seeing,
-        keep_best=params.keep_best,
+        keep_best=float(params.keep_best),
     )
     if filtered is None:
         return fused, Evidence(saturation)
