@@ -18,7 +18,8 @@ TURBRESTORE = "turbrestore"
 SAME = "_sharp"
 # Readers, and the figures of what each reads.
 READ = {"tesseract": "words", "rapidocr": "words_rapidocr"}
-# What is less than this is no lead: dB, and shares of words.
+# Rounding of a figure; and what is less is no lead: dB, and shares of words.
+EQUAL = 0.005
 LEADS = {f"psnr{SAME}": 0.05} | {f"{figure}{SAME}": 0.02 for figure in READ.values()}
 COLUMNS = (
     ("PSNR, dB", "psnr", 2),
@@ -171,6 +172,8 @@ def _cause(name: str, other: Figures, own: Figures, figure: str) -> str:
     if other[merged] == other[figure]:
         return f"{name} sharpens as it merges, so that its stages cannot be told apart."
     less = own[merged] - other[merged]
+    if abs(less) < EQUAL:
+        return f"Before deblurring {name} is neither ahead nor behind, so its blur is removed better."
     size = f"{abs(less):.2f} {'dB' if figure.startswith('psnr') else 'of the words'}"
     if less > 0:
         return f"Before deblurring {name} is {size} behind, so its blur is removed better."

@@ -10,6 +10,7 @@ from turbrestore.blur.psf import KOLMOGOROV, blur_otf
 from turbrestore.deblurring.guards import GuardParams
 from turbrestore.deblurring.remove_blur import guarded_steps, remove_blur_memory, remove_blur_steps
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve_steps
+from turbrestore.deconvolution.primal_dual import EARLY
 from turbrestore.metrics import psnr
 from turbrestore.runtime.steps import finish
 from turbrestore.synthesis.scenes import SCENES
@@ -71,11 +72,37 @@ def test_a_width_far_too_large_is_lowered(name):
     spectrum = np.fft.rfft2(scene) * blur_otf(scene.shape, 2.0, 2.0)
     noise = np.random.default_rng(1).normal(0, 0.002, scene.shape)
     image = (np.fft.irfft2(spectrum, scene.shape) + noise).astype(np.float32)
-    attempt = partial(deconvolve_steps, image, params=replace(WIENER, exponent=2.0))
+
+    def attempt(width, refuse):
+        return deconvolve_steps(image, width, replace(WIENER, exponent=2.0), refuse=refuse)
+
     result, readings = finish(guarded_steps(attempt, image, 4.4, GuardParams()))
     assert not readings[0].passed
     assert readings[-1].passed
     assert 0 < result.sigma == readings[-1].sigma < 4.4
+
+
+def test_a_hopeless_attempt_ends_early_and_the_same_width_is_found(camera):
+    _, image = camera
+    exact = DeconvolutionParams(iterations=60, tolerance=0.0)
+
+    def found_by(attempt):
+        result, readings = finish(guarded_steps(attempt, image, 4.4, GuardParams()))
+        return result, [reading.sigma for reading in readings]
+
+    iterations = []
+
+    def attempt(width, refuse, early=True):
+        result = yield from deconvolve_steps(image, width, exact, refuse=refuse if early else None)
+        iterations.append(result.iterations)
+        return result
+
+    result, widths = found_by(attempt)
+    assert iterations[0] == EARLY
+    assert iterations[-1] == 60
+    whole, same = found_by(partial(attempt, early=False))
+    assert widths == same
+    np.testing.assert_array_equal(result.image, whole.image)
 
 
 def test_every_iteration_of_every_attempt_is_a_step(camera):

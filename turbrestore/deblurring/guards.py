@@ -97,14 +97,20 @@ class GuardParams:
         require_between("overshoot", self.overshoot, 0, 1)
         require_between("noise_gain", self.noise_gain, 1, 1000)
 
+    def failed_slightly(self, reading: GuardReading) -> bool:
+        """Return whether no bound is exceeded by more than a slight factor."""
+        return (
+            max(
+                reading.ringing / max(self.ringing, ROUNDING),
+                reading.overshoot / max(self.overshoot, ROUNDING),
+                reading.noise_gain / self.noise_gain,
+            )
+            <= _SLIGHT
+        )
+
     def first_back_off(self, reading: GuardReading) -> float:
         """Return the factor on the width after the first attempt, if that failed."""
-        excess = max(
-            reading.ringing / max(self.ringing, ROUNDING),
-            reading.overshoot / max(self.overshoot, ROUNDING),
-            reading.noise_gain / self.noise_gain,
-        )
-        return BACK_OFF**0.5 if excess <= _SLIGHT else BACK_OFF
+        return BACK_OFF**0.5 if self.failed_slightly(reading) else BACK_OFF
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,8 @@ MOST_THREADS = 4
 
 # What the image alone tells, and what the image and the frames tell; None where it is not asked.
 FoundBlur = tuple[BlurEstimate | None, BlurPosterior | None]
+# Whether an image, half deconvolved, need not be deconvolved further.
+Refusal = Callable[[FloatArray], bool]
 
 
 @dataclass(frozen=True)
@@ -103,9 +105,10 @@ def remove_blur_steps(
     size = image.shape[0], image.shape[1]
     in_tiles = () if side is None or find_device(runtime.device) != CPU else halo_tiles(size, side)
 
-    def remove(width: float) -> Steps[Deconvolution]:
+    def remove(width: float, refuse: Refusal | None = None) -> Steps[Deconvolution]:
         kernel = width if psf is None or width == 0 else psf
-        return tiled_deconvolution_steps(image, kernel, params, guide, runtime, in_tiles, photons, full_scale, noise)
+        known = photons, full_scale, noise
+        return tiled_deconvolution_steps(image, kernel, params, guide, runtime, in_tiles, *known, refuse)
 
     if blur is None:
         result = yield from remove(sigma)
@@ -133,16 +136,19 @@ def tiled_deconvolution_steps(
     photons: NoiseCurve | None = None,
     full_scale: tuple[float, float] = (0.0, 1.0),
     noise: NoiseSpectrum | None = None,
+    refuse: Refusal | None = None,
 ) -> Steps[Deconvolution]:
     """Deconvolve an image (H, W) or (H, W, 3) in overlapping tiles, by the blur and the fidelity λ of the whole.
 
     The weights, the end of the iterations and a periodic boundary are those of each tile, so the result differs a bit
-    from that of the whole image.  ``sigma`` may be a PSF (h, w); ``guide`` (H, W) or (H, W, 3).
+    from that of the whole image.  ``sigma`` may be a PSF (h, w); ``guide`` (H, W) or (H, W, 3).  ``refuse`` can end the
+    deconvolution of a whole image early; a tile does not tell what the whole is like.
     """
     pixels = check_image(image)
     guide_image = None if guide is None else check_image(guide, "guide")
+    known = photons, full_scale, noise
     if not np.any(sigma) or len(tiles) < 2:
-        whole = yield from deconvolve_steps(pixels, sigma, params, guide_image, runtime, photons, full_scale, noise)
+        whole = yield from deconvolve_steps(pixels, sigma, params, guide_image, runtime, *known, refuse)
         return replace(whole, image=to_scratch(whole.image, runtime.scratch))
     params = params or DeconvolutionParams()
     # Each tile chooses its own h for the nonlocal weights, from its guide after sharpening; that of the whole guide
@@ -152,7 +158,7 @@ def tiled_deconvolution_steps(
     for tile in tiles:
         guide_part = None if guide_image is None else guide_image[tile.rows, tile.columns]
         cut = pixels[tile.rows, tile.columns]
-        part = yield from deconvolve_steps(cut, sigma, params, guide_part, runtime, photons, full_scale, noise)
+        part = yield from deconvolve_steps(cut, sigma, params, guide_part, runtime, *known)
         add_tile(restored, tile, part.image)
         parts.append(replace(part, image=restored))
     level = float(np.sqrt(np.mean([part.noise**2 for part in parts])))
@@ -166,7 +172,10 @@ def remove_blur_memory(shape: tuple[int, ...], params: DeconvolutionParams, side
     part = shape if side is None else (*largest_tile((shape[0], shape[1]), side), *shape[2:])
     beside = float(pixels * (_BYTES + channels * _CHANNEL_BYTES))
     params = params if params.sigma is not None else replace(params, sigma=WIDEST)
-    return float(pixels * channels * _RESULTS_BYTES) + max(beside, deconvolution_memory(part, params, MOST_THREADS))
+    solved = deconvolution_memory(part, params, MOST_THREADS)
+    # The guards look at a whole image while it is deconvolved, at tiles only when all are done.
+    together = beside + solved if side is None else max(beside, solved)
+    return float(pixels * channels * _RESULTS_BYTES) + together
 
 
 def blur_to_remove(
@@ -179,20 +188,27 @@ def blur_to_remove(
 
 
 def guarded_steps(
-    attempt: Callable[[float], Steps[Deconvolution]],
+    attempt: Callable[[float, Refusal], Steps[Deconvolution]],
     blurred: FloatArray,
     sigma: float,
     guards: GuardParams,
 ) -> Steps[tuple[Deconvolution, tuple[GuardReading, ...]]]:
-    """Deconvolve an image (H, W[, 3]) by smaller and smaller widths until the guards pass."""
+    """Deconvolve an image (H, W[, 3]) by smaller and smaller widths until the guards pass.
+
+    An attempt ends early where they object by far.
+    """
     readings: list[GuardReading] = []
+
+    def refuse(image: FloatArray) -> bool:
+        return not guards.failed_slightly(evaluate_guards(image, blurred, sigma, guards))
+
     while sigma > 0 and len(readings) < _MOST_TRIES:
-        result = yield from attempt(sigma)
+        result = yield from attempt(sigma, refuse)
         readings.append(evaluate_guards(result.image, blurred, sigma, guards))
         if readings[-1].passed:
             return result, tuple(readings)
         sigma *= BACK_OFF if len(readings) > 1 else guards.first_back_off(readings[0])
-    result = yield from attempt(0.0)
+    result = yield from attempt(0.0, refuse)
     return result, tuple(readings)
 
 

@@ -15,6 +15,7 @@ The nltv and tv problems are solved by :mod:`turbrestore.deconvolution.primal_du
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Literal
@@ -244,11 +245,13 @@ def deconvolve_steps(
     photons: NoiseCurve | None = None,
     full_scale: tuple[float, float] = (0.0, 1.0),
     spectrum: NoiseSpectrum | None = None,
+    refuse: Callable[[FloatArray], bool] | None = None,
 ) -> Steps[Deconvolution]:
     """Deblur an image step by step; arguments, errors and result as of :func:`deconvolve`.
 
     ``photons`` is the noise of the image at every level, relative to its mean; ``full_scale`` is black and white, to
-    which the result is clipped; ``spectrum`` is the noise of the luminance, if the frames have told it.
+    which the result is clipped; ``spectrum`` is the noise of the luminance, if the frames have told it.  ``refuse``
+    tells by the image after a few iterations whether to end there.
     """
     params = settings_of(DeconvolutionParams, params)
     pixels = check_image(image)
@@ -287,11 +290,16 @@ def deconvolve_steps(
             if grey.shape != margin.size:
                 raise DataError(f"guide: expected the size of the image {margin.size}, found {grey.shape}")
             guide_image = margin.pad(grey)
-        solution = yield from _solve(problems, guide_image, noise, measured, params, team)
-    restored = join_planes(pixels, [store(u)[margin.inside()] for u in solution.images], params.channels)
+
+        def shown(images: list[Stack]) -> FloatArray:
+            planes = [store(u)[margin.inside()] for u in images]
+            return np.clip(join_planes(pixels, planes, params.channels), *full_scale)
+
+        stop = None if refuse is None else lambda images: refuse(shown(images))
+        solution = yield from _solve(problems, guide_image, noise, measured, params, team, stop)
     records = (np.array(column) for column in zip(*solution.records, strict=True))
     return Deconvolution(
-        np.clip(restored, *full_scale), sigma, fidelity, noise, solution.iterations, solution.converged, *records
+        shown(solution.images), sigma, fidelity, noise, solution.iterations, solution.converged, *records
     )
 
 
@@ -325,8 +333,9 @@ def _solve(
     measured: Stack,
     params: DeconvolutionParams,
     team: ThreadTeam,
+    refuse: Callable[[list[Stack]], bool] | None,
 ) -> Steps[Solution]:
-    stop = measured, params.iterations, params.tolerance
+    stop = measured, params.iterations, params.tolerance, refuse
     if params.method in ("wiener", "tikhonov"):
         quadratic = quadratic_solver(problems[0], params.method)
         return (yield from iterate(quadratic, problems, [quadratic.start(p) for p in problems], *stop))

@@ -21,12 +21,17 @@ That is too much for an image that oscillates.  So primal-dual splitting also st
 differs from the images after each of the last windows (``turbrestore.deconvolution.primal_dual.REST``) by no more than
 the tolerance.  Neither rule is a bound: ``benchmarks/stopping.py`` measures that the remaining change is hardly
 visible, and an image that drifts very slowly may be taken to be at rest.
+
+A caller who may refuse the result is asked about the image after ``turbrestore.deconvolution.primal_dual.EARLY``
+iterations, by when most images are at rest, and the solver ends there if he refuses it.  Of others, whose deblurring
+took up to 400 iterations, the guards read nearly what they read at the end (four clips of charts and words: ringing .41
+and .35, .73 and .76, .34 and .33, .59 and .58).
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -36,7 +41,7 @@ from numpy.typing import NDArray
 from ..runtime.image_stacks import Stack, namespace, store
 from ..runtime.steps import Result
 from .conjugate_gradient import ConjugateGradients
-from .primal_dual import PrimalDual
+from .primal_dual import EARLY, PrimalDual
 from .problem import Problem
 
 # Pixels a side of the tiles that changes are measured in.
@@ -78,8 +83,9 @@ def iterate(
     measured: Stack,
     iterations: int,
     tolerance: float,
+    refuse: Callable[[list[Stack]], bool] | None = None,
 ) -> Steps[Solution]:
-    """Step the problems of all channels until no image changes any more."""
+    """Step the problems of all channels until no image changes any more, or until they are refused."""
     images = [state.image for state in states]
     earlier = deque([images], max(solver.rest, 1))
     changes, records, begun, converged = list[float](), list[tuple[int, float, float]](), 0, False
@@ -93,6 +99,8 @@ def iterate(
             if not converged and full and len(earlier) == solver.rest:
                 converged = all(change_of(old, images, measured) <= tolerance for old in earlier)
             begun, last = iteration, last or converged
+            if iteration == EARLY and not last and refuse is not None:
+                last = refuse(images)
             earlier.append(images)
         change = changes[-1] / solver.window if changes else np.inf
         if last or iteration % _RECORD_EVERY == 0:

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from ..blur.psf import GAUSSIAN, blur_otf
 from ..core.arrays import ROUNDING, FloatArray, luminance
 from ..core.decision import Decision
-from ..deblurring.remove_blur import guarded_steps
+from ..deblurring.remove_blur import Refusal, guarded_steps
 from ..deconvolution.deconvolve import Deconvolution, deconvolve_steps
 from ..deconvolution.stopping import Steps
 from ..preparation import Prepared
@@ -174,9 +174,9 @@ def _removed(
     exponent = params.deconvolution.exponent or (GAUSSIAN if blur is None else blur.exponent)
     settings = replace(params.deconvolution, sigma=None, exponent=None)
 
-    def attempt(width: float) -> Steps[Deconvolution]:
+    def attempt(width: float, refuse: Refusal | None = None) -> Steps[Deconvolution]:
         psf = fine_psf(width, exponent, scale)
-        found = yield from deconvolve_steps(image, psf, settings, image, runtime, full_scale=full_scale)
+        found = yield from deconvolve_steps(image, psf, settings, image, runtime, full_scale=full_scale, refuse=refuse)
         return replace(found, sigma=width)
 
     if params.deconvolution.sigma is not None:
