@@ -198,7 +198,7 @@ class TestOrders:
 class TestTuning:
     def test_it_starts_from_the_shape_that_was_removed(self, restored):
         width = np.array([1.0, 1.2, 1.4])
-        posterior = BlurPosterior(1.1, 1.37, width, width, width, width, air=1.0, edge_limited=False)
+        posterior = BlurPosterior(1.1, 1.37, *[width] * 5, air=1.0, edge_limited=False)
         found = replace(restored.restoration, posterior=posterior)
         assert tuned_params(replace(restored, restoration=found)).exponent == 1.37
 

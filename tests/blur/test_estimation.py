@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from turbrestore.blur.estimation import (
+    PART,
     BlurEstimate,
-    _most_detailed,
     _preference,
     _reduce,
     estimate_blur,
     find_candidates,
+    most_detailed,
     removable_width,
     unreduced_width,
 )
@@ -37,7 +38,7 @@ def test_the_part_with_most_detail_is_found_in_strips(shape, kind):
     if kind != "noise":
         # Many parts have the same detail, except for rounding.
         image = np.tile(image[:16, :16], (45, 20))[: shape[0], : shape[1]] if kind == "repeated" else 0 * image
-    part = _most_detailed(image)
+    part = most_detailed(image, PART)
     height, width = part.shape
     energy = np.square(cv2.Laplacian(cv2.GaussianBlur(image, (0, 0), 1.0), cv2.CV_32F))
     total = np.pad(np.cumsum(np.cumsum(energy, 1, np.float64), 0), ((1, 0), (1, 0)))
@@ -108,7 +109,7 @@ def test_colour_is_reduced_to_luminance():
 def test_the_uncertainty_is_half_the_difference_between_half_and_twice_the_noise(sigma):
     image = blurred("camera", sigma, 0.005)
     found = estimate_blur(image)
-    gradients = image_gradients(_most_detailed(_reduce(image, found.reduction)))
+    gradients = image_gradients(most_detailed(_reduce(image, found.reduction), PART))
     with one_thread_each():
         shapes = [fused_exponent(found.reduction * width) for width in WIDTHS]
         both = [width_costs(gradients, shapes, factor * found.noise, 1) for factor in (0.5, 2.0)]
@@ -178,9 +179,9 @@ def test_a_reduction_averages_whole_blocks():
 def test_the_most_detailed_part_holds_the_detail():
     image = np.zeros((300, 400), np.float32)
     image[200:280, 250:350] = np.random.default_rng(5).random((80, 100))
-    part = _most_detailed(image)
+    part = most_detailed(image, PART)
     assert part.shape == (129, 129)
-    assert _most_detailed(image[:128, :70]).shape == (121, 65)
+    assert most_detailed(image[:128, :70], PART).shape == (121, 65)
     assert part.sum() == pytest.approx(image.sum())
 
 

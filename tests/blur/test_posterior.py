@@ -151,9 +151,21 @@ def test_networks_get_the_quantiles_of_the_posterior_and_its_shape_is_removed(mo
     np.testing.assert_array_equal(given[0], by_theory.width)
     assert given[1] == evidence.estimate.sigma > 1
     assert found.removed == 1.1 and found.width.tolist() == [1.0, 1.2, 1.4]
+    assert np.isnan(found.by_tones).all()
     assert found.exponent == (exponent or by_theory.exponent)
     _, careful = estimate_posterior(image, witnesses, white_noise(0.001), exponent=exponent, cautious=True)
     assert careful.removed == 0.9
+
+
+@pytest.mark.parametrize("cautious", [False, True])
+def test_two_tones_of_the_image_alone_tell_its_blur(cautious):
+    scene = SCENES["chart"](192, 192)
+    frames, flows = still_clip(cv2.GaussianBlur(scene, (0, 0), 1.2))
+    image = frames.mean(axis=0)
+    witnesses = measure_witnesses(frames, flows, image, BlurWitnesses(0.0, 12.0))
+    _, found = estimate_posterior(image, witnesses, white_noise(0.001), exponent=2.0, cautious=cautious)
+    assert found.removed == found.width[1] == found.by_tones[1] == pytest.approx(1.2, rel=0.15)
+    assert "by the two tones of the image" in explain_posterior(found, found.removed).reason
 
 
 def test_one_wrong_witness_is_outvoted():

@@ -151,7 +151,7 @@ def _fields(kind, height, width, count):
         "C": (height * width * 2, count), "A": (count, count), "mean_flow": (height, width, 2),
         "residual_variance": (height, width), "states": (count, count + 1),
         "singular_values": (count + 1,), "flow_states": (count, 2),
-        **dict.fromkeys(("width", "by_displacement", "by_variation", "by_image"), (3,)),
+        **dict.fromkeys(("width", "by_displacement", "by_variation", "by_image", "by_tones"), (3,)),
     }  # fmt: skip
     scalars = {"float": st.floats(0, 1), "int": st.integers(1, 10**9), "bool": st.booleans()}
     scalars["tuple[str, ...]"] = st.lists(TEXT, max_size=3).map(tuple)

@@ -71,7 +71,7 @@ _RESOLVED = 0.6
 _EVIDENCE, _STRONG_EVIDENCE, _SOFT_EVIDENCE = 0.08, 0.2, 0.23
 # Side of the part that is analysed; rows of positions at which detail is measured at a time, and how far its filters
 # reach, pixels.
-_PART, _STRIP_ROWS, _REACH = 128, 256, 5
+PART, _STRIP_ROWS, _REACH = 128, 256, 5
 # 125 is a power of five: transforms of this size take almost twice as long as those of 120×120 or of 128×128 pixels.
 _SLOW_SIZE = 125
 # Factor on the relative uncertainty of the image itself if its evidence is strong; exponent of the preference for
@@ -278,7 +278,7 @@ def _find_candidate(
 ) -> BlurCandidate:
     reduced = _reduce(grey, factor)
     # A copy, so that the reduced image is freed.
-    part = _most_detailed(reduced).copy()
+    part = most_detailed(reduced, PART).copy()
     level = assumed_noise(reduced, multiple=multiple) if noise is None else assumed_noise(reduced, noise / factor)
     costs = width_costs(image_gradients(part), _exponents(exponent, factor), level, rises=2)
     evidence, width = float(costs[0] - costs.min()), unreduced_width(likeliest_width(costs), factor)
@@ -314,9 +314,9 @@ def _reduce(grey: FloatArray, factor: int) -> FloatArray:
     return cv2.resize(grey[: height * factor, : width * factor], (width, height), interpolation=cv2.INTER_AREA)
 
 
-def _most_detailed(image: FloatArray) -> FloatArray:
-    """Part with the largest energy of the Laplacian, of a size whose gradients transform fast."""
-    height, width = (_fast_size(min(_PART, size - 1)) + 1 for size in image.shape)
+def most_detailed(image: FloatArray, side: int) -> FloatArray:
+    """Part of about this side with the largest energy of the Laplacian, of a size whose gradients transform fast."""
+    height, width = (_fast_size(min(side, size - 1)) + 1 for size in image.shape)
     best, top, left = -np.inf, 0, 0
     for start in range(0, image.shape[0] - height + 1, _STRIP_ROWS):
         sums = cv2.integral(_detail(image, start, start + _STRIP_ROWS - 1 + height))

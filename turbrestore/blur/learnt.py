@@ -42,14 +42,14 @@ from ..core.noise_spectrum import NoiseSpectrum
 from .psf import Float64Array
 from .witnesses.image_evidence import ImageEvidence
 from .witnesses.spectral_variation import RINGS, SIDE, SpectralVariation, window_power, window_weights
+from .witnesses.two_tones import GRID
 
 # Grid of G: widths relative to that of the posterior, the first of which is no blur.
 FACTORS: Float64Array = np.array([0, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.35, 1.6, 2.0, 2.6])
-# Rings whose values are read, and widths at which costs of the image are read, pixels.
+# Rings whose values are read.
 _PICKED = np.array([1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20, 24, 28])
-_COSTS: Float64Array = np.geomspace(0.3, 9, 14)
 # Costs of a gradient above this are all the same, and so many gradients make a unit.
-_DEAREST, _GRADIENTS = 20.0, 40.0
+_DEAREST, GRADIENTS = 20.0, 40.0
 # Decibels by which a wider blur may gain less, and number of factors that are tried.
 _ALIKE, _TRIED = 0.2, 200
 # Least and largest logarithm of the deviation that a network is trained to say.
@@ -110,8 +110,8 @@ def blur_features(
         ]
     costs, estimate = evidence.costs - evidence.costs.min(), evidence.estimate
     for curve in costs:
-        read = _GRADIENTS * np.interp(np.log(_COSTS), np.log(evidence.widths), curve)
-        rows += [[np.log(evidence.widths[curve.argmin()]), min(_GRADIENTS * curve.min(), _DEAREST)]]
+        read = GRADIENTS * np.interp(np.log(GRID), np.log(evidence.widths), curve)
+        rows += [[np.log(evidence.widths[curve.argmin()]), min(GRADIENTS * curve.min(), _DEAREST)]]
         rows += [np.minimum(read, _DEAREST)]
     rows += [_log([estimate.sigma], 0.05), [np.log(estimate.reduction)], _log([estimate.noise], 1e-5)]
     rows += [_distribution(image)]

@@ -24,9 +24,11 @@ does not blur it.
 
 The air and the lens look alike in 1 and 3, and the air alone varies.
 
-The width that is reported is learnt from simulated clips, for which this posterior and all that the witnesses measure
-are the input.  The width that is removed follows from a learnt one, from this posterior and from the image alone
-(:mod:`turbrestore.blur.learnt`); its exponent is that of this posterior.
+Where the image has two tones, these alone tell the width that is reported and removed
+(:mod:`turbrestore.blur.witnesses.two_tones`).  Elsewhere the width that is reported is learnt from simulated
+clips, for which this posterior and all that the other witnesses measure are the input.  The width that is removed
+follows from a learnt one, from this posterior and from the image alone (:mod:`turbrestore.blur.learnt`).  The exponent
+is always that of this posterior.
 
 Constants of the likelihoods were set on simulated clips; ``benchmarks/results/blur_calibration.md`` is of others.
 """
@@ -42,12 +44,14 @@ from ..core.arrays import FloatArray
 from ..core.noise_spectrum import NoiseSpectrum
 from ..registration.registered_noise import noise_of_frames
 from ..runtime.runtime import DEFAULT, Runtime
-from .learnt import blur_features, learnt_blur
+from .estimation import PART, most_detailed
+from .learnt import GRADIENTS, blur_features, learnt_blur
 from .psf import Float64Array
 from .witnesses.hypotheses import LEAST_TRANSFER, Hypotheses, hypotheses, shapes
 from .witnesses.image_evidence import EXPONENTS, ImageEvidence, image_evidence
 from .witnesses.short_exposure import TILT_SPREAD
 from .witnesses.spectral_variation import RINGS, SpectralVariation, measure_variation
+from .witnesses.two_tones import two_tones
 
 # How much less likely the narrowest lens is, as a logarithm, where frames have been moved and hence interpolated.
 _INTERPOLATED = 3.0
@@ -66,8 +70,7 @@ _STRETCH, _SHIFT, _NOISE_ERROR = (0.8, 1.36), (1.0, 0.25), (0.15, 0.3)
 _MODEL_ERROR, _LEAST_ERROR, _RING_WEIGHT = 0.3, 1e-3, 0.35
 # Rings that count, as long as the signal exceeds the noise by this factor.
 _FIRST_RING, _LAST_RING, _CLEAR = 2, 25, 2.0
-# κ_m; softness of scenes, pixels, with weights.
-_GRADIENTS = 40.0
+# Softness of scenes, pixels, with weights; κ_m is :data:`turbrestore.blur.learnt.GRADIENTS`.
 _SOFTNESS = ((0.25, 0.36), (0.5, 0.35), (0.8, 0.2), (1.15, 0.07), (1.6, 0.02))
 # The most that displacement, variation and image count against a hypothesis, as logarithms: the model of a witness may
 # not hold.  Together the two witnesses of the frames outvote the image; alone, the image outvotes either.
@@ -99,6 +102,7 @@ class BlurPosterior:
     by_displacement: Float64Array
     by_variation: Float64Array
     by_image: Float64Array
+    by_tones: Float64Array
     air: float  # probability that the air has blurred the image
     edge_limited: bool  # whether less is removed because the edges of the image are too steep for more
 
@@ -143,7 +147,13 @@ def estimate_posterior(
     facts = by_theory.air, by_theory.exponent, witnesses.displacement, witnesses.independent_frames
     features = blur_features(image, np.array(widths), variation, ratio, evidence, noise, facts)
     alone = evidence.estimate.sigma if evidence.estimate.blurred else 0.0
-    found, shape = learnt_blur(features, by_theory.width, alone), exponent or by_theory.exponent
+    shape = exponent or by_theory.exponent
+    part = image if max(image.shape) <= 2 * PART else most_detailed(image, 2 * PART)
+    tones = two_tones(part, noise, shape)
+    if tones is not None and tones.clear:
+        told = tones.quantiles
+        return evidence, replace(by_theory, removed=tones.width, exponent=shape, width=told, by_tones=told)
+    found = learnt_blur(features, by_theory.width, alone)
     removed = found.cautious if cautious else found.removed
     return evidence, replace(by_theory, removed=removed, exponent=shape, width=found.width)
 
@@ -188,6 +198,7 @@ def blur_posterior(
         by_displacement=quantiles(of_v),
         by_variation=quantiles(of_s),
         by_image=quantiles(of_image),
+        by_tones=np.full(len(_QUANTILES), np.nan),
         air=float(1 - weights[-1].sum()),
         edge_limited=False,
     )
@@ -273,7 +284,7 @@ def clear_rings(measured: SpectralVariation) -> NDArray[np.int_]:
 
 def image_likelihood(grid: Hypotheses, evidence: ImageEvidence, kappa: float, scale: int) -> Float64Array:
     """Log likelihood of the image for every hypothesis, mean over the softness of the scene."""
-    curves = -np.minimum(_GRADIENTS * (evidence.costs - evidence.costs.min()), EXCLUDED[2])
+    curves = -np.minimum(GRADIENTS * (evidence.costs - evidence.costs.min()), EXCLUDED[2])
     place = np.interp(grid.exponent, EXPONENTS, np.arange(len(EXPONENTS)))
     low = np.minimum(place.astype(int), len(EXPONENTS) - 2)
     share, logs = place - low, np.log(evidence.widths)

@@ -48,7 +48,8 @@ def explain_posterior(posterior: BlurPosterior, removed: float) -> Decision:
     cause = "caused mostly by the air" if posterior.air > _MOSTLY else "caused by the air or the lens"
     if posterior.air < 1 - _MOSTLY:
         cause = "not caused by the air"
-    reason = f"measured {width:.2f} pixels ({low:.2f} to {high:.2f}), {cause}; expected {said}"
+    told = " by the two tones of the image" if np.isfinite(posterior.by_tones).all() else ""
+    reason = f"measured {width:.2f} pixels ({low:.2f} to {high:.2f}){told}, {cause}; expected {said}"
     if posterior.edge_limited:
         reason = f"the edges of the image are too steep for more; {reason}"
     elif posterior.removed == 0:

@@ -127,6 +127,7 @@ def _witnesses(posterior: BlurPosterior) -> Panel:
         "motion": posterior.by_displacement,
         "variation": posterior.by_variation,
         "edges": posterior.by_image,
+        "two tones": posterior.by_tones,
         "all": posterior.width,
     }
     widths = {name: found for name, found in widths.items() if np.isfinite(found).all()}

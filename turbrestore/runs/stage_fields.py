@@ -100,7 +100,9 @@ FIELDS: dict[str, dict[str, ArraySpec | NumberSpec]] = {
     "noise": dict.fromkeys(("power", "error", "relative"), ArraySpec("f8", "k", low=0)),
     "posterior": {
         "width": ArraySpec("f8", "3", low=0),
-        **dict.fromkeys(("by_displacement", "by_variation", "by_image"), ArraySpec("f8", "3", low=0, gaps=True)),
+        **dict.fromkeys(
+            ("by_displacement", "by_variation", "by_image", "by_tones"), ArraySpec("f8", "3", low=0, gaps=True)
+        ),
         "air": NumberSpec(high=1 + _ROUNDING),
     },
 }
