@@ -173,7 +173,7 @@ def _cause(name: str, other: Figures, own: Figures, figure: str) -> str:
         return f"{name} sharpens as it merges, so that its stages cannot be told apart."
     less = own[merged] - other[merged]
     if abs(less) < EQUAL:
-        return f"Before deblurring {name} is neither ahead nor behind, so its blur is removed better."
+        return f"Before deblurring {name} is neither ahead nor behind; its lead comes from the deblurring."
     size = f"{abs(less):.2f} {'dB' if figure.startswith('psnr') else 'of the words'}"
     if less > 0:
         return f"Before deblurring {name} is {size} behind, so its blur is removed better."

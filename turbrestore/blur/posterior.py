@@ -133,10 +133,11 @@ def estimate_posterior(
     exponent: float | None = None,
     cautious: bool = False,
 ) -> tuple[ImageEvidence | None, BlurPosterior]:
-    """Estimate the blur of an image (H, W) of some noise; none is removed where it shows nothing or a loss is expected.
+    """Estimate the blur of an image (H, W) of some noise; none is removed where it shows nothing.
 
-    ``exponent`` is that of the transfer function, if it is given; the width is still chosen for that of the posterior.
-    ``cautious`` leaves what the image alone tells out of the width, for callers who weigh it themselves.
+    ``exponent`` is that of the transfer function, if it is given.  Where the image has two tones, they tell the width
+    for that exponent.  Elsewhere the width is chosen for the exponent of the posterior, and is 0 where a loss is
+    expected; ``cautious`` then leaves out what the image alone tells, for callers who weigh it themselves.
     """
     evidence, variation = image_evidence(image, runtime), witnesses.variation
     ratio = None if variation is None else variation.with_power(image)

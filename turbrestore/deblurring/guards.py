@@ -97,8 +97,8 @@ class GuardParams:
         require_between("overshoot", self.overshoot, 0, 1)
         require_between("noise_gain", self.noise_gain, 1, 1000)
 
-    def failed_slightly(self, reading: GuardReading) -> bool:
-        """Return whether no bound is exceeded by more than a slight factor."""
+    def within_reach(self, reading: GuardReading) -> bool:
+        """Return whether no bound is exceeded by more than a slight factor, if one is."""
         return (
             max(
                 reading.ringing / max(self.ringing, ROUNDING),
@@ -110,7 +110,7 @@ class GuardParams:
 
     def first_back_off(self, reading: GuardReading) -> float:
         """Return the factor on the width after the first attempt, if that failed."""
-        return BACK_OFF**0.5 if self.failed_slightly(reading) else BACK_OFF
+        return BACK_OFF**0.5 if self.within_reach(reading) else BACK_OFF
 
 
 @dataclass(frozen=True)

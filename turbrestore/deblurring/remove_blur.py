@@ -47,7 +47,7 @@ MOST_THREADS = 4
 
 # What the image alone tells, and what the image and the frames tell; None where it is not asked.
 FoundBlur = tuple[BlurEstimate | None, BlurPosterior | None]
-# Whether an image, half deconvolved, need not be deconvolved further.
+# Whether to end a deconvolution early, judged by its image so far.
 Refusal = Callable[[FloatArray], bool]
 
 
@@ -174,7 +174,7 @@ def remove_blur_memory(shape: tuple[int, ...], params: DeconvolutionParams, side
     params = params if params.sigma is not None else replace(params, sigma=WIDEST)
     solved = deconvolution_memory(part, params, MOST_THREADS)
     # The guards look at a whole image while it is deconvolved, at tiles only when all are done.
-    together = beside + solved if side is None else max(beside, solved)
+    together = beside + solved if part == shape else max(beside, solved)
     return float(pixels * channels * _RESULTS_BYTES) + together
 
 
@@ -200,7 +200,7 @@ def guarded_steps(
     readings: list[GuardReading] = []
 
     def refuse(image: FloatArray) -> bool:
-        return not guards.failed_slightly(evaluate_guards(image, blurred, sigma, guards))
+        return not guards.within_reach(evaluate_guards(image, blurred, sigma, guards))
 
     while sigma > 0 and len(readings) < _MOST_TRIES:
         result = yield from attempt(sigma, refuse)

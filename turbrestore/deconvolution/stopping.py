@@ -23,7 +23,7 @@ the tolerance.  Neither rule is a bound: ``benchmarks/stopping.py`` measures tha
 visible, and an image that drifts very slowly may be taken to be at rest.
 
 A caller who may refuse the result is asked about the image after ``turbrestore.deconvolution.primal_dual.EARLY``
-iterations, by when most images are at rest, and the solver ends there if he refuses it.  Of others, whose deblurring
+iterations, by when most images are at rest, and the solver ends there if it is refused.  Of others, whose deblurring
 took up to 400 iterations, the guards read nearly what they read at the end (four clips of charts and words: ringing .41
 and .35, .73 and .76, .34 and .33, .59 and .58).
 """

@@ -7,13 +7,17 @@ need not be known, and where a scene is like that, no other witness is as exact.
 
 Symbols
 -------
-f, u : image, and the image without a blur of some width by a Wiener filter; a, b : the two levels of a tile of u
-m(σ) : spread about the two levels of a tile relative to their distance, ``ln Σ min((u − a)², (u − b)²) / (b − a)²``,
-    the weighted mean over the tiles; the weights are the variances of the tiles of f
-d : depth of the minimum, the m of the image as it is less the least m
+f, u : image, and the image without a blur of width σ by a Wiener filter
+a, b : the two levels of a tile of u
+v(σ) : spread about the two levels of a tile relative to their distance, the mean of
+    ``min((u − a)², (u − b)²) / (b − a)²`` over its pixels and over the tiles, weighted by their variances in f
+d : depth of the least v, ``ln v(σ) − ln v`` from the narrowest σ that is tried, at which u is nearly f
 
 The filter passes ``H / (H² + N / S)`` with the spectrum N of the noise; the power S of the scene falls as ν^−2, as that
-of photographs does (Field 1987), to the variance of f.
+of photographs does (Field 1987), and its mean is the variance of f.
+
+In white noise v is 1/7, and on a ramp, whose levels are all alike, 1/12.  Noise on a ramp thus has its least v where
+the noise has been smoothed, though the ramp has no two tones; so v also has to be below half that of a ramp.
 """
 
 from __future__ import annotations
@@ -29,7 +33,7 @@ from ...core.noise_spectrum import NoiseSpectrum
 from ...core.thresholds import threshold
 from ..psf import Float64Array, blur_otf
 
-# Widths that are tried, pixels.
+# Widths that are tried, pixels.  The networks read at these too, so that others ask for networks trained anew.
 GRID: Float64Array = np.geomspace(0.3, 9.0, 14)
 
 
@@ -37,21 +41,22 @@ GRID: Float64Array = np.geomspace(0.3, 9.0, 14)
 class _Thresholds:
     """What tells a scene of two tones from others.
 
-    Measured on the 1,731 training clips of ``benchmarks/blur_training.py``, 27 of which have two tones.  Gains are over
-    the width that networks choose which were not trained on the clip.
+    Measured on 1,731 training clips of ``benchmarks/blur_training.py``, of which about 27 have two tones; its table has
+    those of the last training.  Gains are over the width that networks choose which were not trained on the clip.
     """
 
     # Side of a tile: a letter or some bars.
     tile: int = threshold(16, "pixels", "measured: gains 0.8 dB; 24 pixels gain 0.4 dB, and 36 lose 0.3")
-    # Least depth d of a scene of two tones.
+    # Least depth d of a scene of two tones, and its largest v.
     depth: float = threshold(0.45, "1", "measured: gains 0.8 dB on the 27 clips above; loses 0.5 dB from 0.40 to 0.45")
-    # The width that is told over that of the minimum, and the deviation of its logarithm.
+    spread: float = threshold(1 / 24, "1", "theory: half of the v of a ramp")
+    # The width that is told over that of the least v, and the deviation of its logarithm.
     width: float = threshold(0.95, "1", "measured: 0.90 and 0.95 gain 0.8 dB, 1.00 gains 0.5")
     deviation: float = threshold(0.12, "1", "measured: scatter of the minimum over the true width on these clips")
     # Least noise of an image: less would regain nothing but what registration has left.
     noise: float = threshold(1 / (255 * 12**0.5), "intensity", "bits: deviation of the rounding to 8 bits")
     # Steps to the two levels of a tile.
-    steps: int = threshold(6, "steps", "test: test_more_steps_change_nothing")
+    steps: int = threshold(6, "steps", "cost: twenty tell the same width within 1 %")
 
 
 LIMITS = _Thresholds()
@@ -61,12 +66,13 @@ class TwoTones(NamedTuple):
     """What the two tones of an image tell of its blur."""
 
     width: float  # pixels
-    depth: float  # d
+    depth: float  # d; 0 where the least v is that of the widest or the narrowest blur
+    spread: float  # least v
 
     @property
     def clear(self) -> bool:
         """Whether the scene has two tones, so that the width is known."""
-        return self.depth >= LIMITS.depth
+        return self.depth >= LIMITS.depth and self.spread <= LIMITS.spread
 
     @property
     def quantiles(self) -> Float64Array:
@@ -79,19 +85,22 @@ def two_tones(image: FloatArray, noise: NoiseSpectrum, exponent: float) -> TwoTo
 
     None where the image is too small or flat.
     """
-    if min(image.shape) < 2 * LIMITS.tile or np.ptp(image) == 0:
+    if min(image.shape) < 2 * LIMITS.tile:
         return None
-    tiles = _tiles(image)
-    weights = tiles.var(axis=1)
+    weights = _tiles(image).var(axis=1)
+    # The flatter half of the tiles holds no edge, or only part of one.
     chosen = weights >= np.median(weights)
+    if weights.max() <= ROUNDING:
+        return None
     spreads = [_spread(_tiles(one)[chosen], weights[chosen]) for one in _without_blur(image, noise, exponent)]
     curve = np.log(spreads)
     least = int(curve.argmin())
-    place = float(np.log(GRID[least]))
-    if 0 < least < len(curve) - 1:
-        before, here, after = curve[least - 1 : least + 2]
-        place += np.log(GRID[1] / GRID[0]) * (before - after) / (2 * (before - 2 * here + after))
-    return TwoTones(LIMITS.width * float(np.exp(place)), float(curve[0] - curve[least]))
+    if not 0 < least < len(curve) - 1:
+        return TwoTones(LIMITS.width * float(GRID[least]), 0.0, float(spreads[least]))
+    before, here, after = curve[least - 1 : least + 2]
+    step = (before - after) / (2 * (before - 2 * here + after))
+    width = LIMITS.width * float(GRID[least] * (GRID[1] / GRID[0]) ** step)
+    return TwoTones(width, float(curve[0] - here), float(spreads[least]))
 
 
 def _without_blur(image: FloatArray, noise: NoiseSpectrum, exponent: float) -> list[FloatArray]:
@@ -118,7 +127,7 @@ def _tiles(image: FloatArray) -> FloatArray:
 
 
 def _spread(tiles: FloatArray, weights: NDArray[np.floating]) -> float:
-    """Mean of exp m over tiles (n, pixels), whose two levels are found by 2-means from their least and largest."""
+    """Return v of tiles (n, pixels), whose two levels are found by 2-means from the least and the largest value."""
     low, high = tiles.min(axis=1), tiles.max(axis=1)
     for _ in range(LIMITS.steps):
         above = tiles > ((low + high) / 2)[:, None]
