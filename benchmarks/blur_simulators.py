@@ -256,7 +256,7 @@ def _wandering(
 
 
 def record(frames: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Frames as a camera keeps them: noise, its reduction or sharpening, H.264 or HEVC, eight bits."""
+    """Frames as a camera keeps them: noise, its reduction or sharpening, H.264, eight bits."""
     noise = float(np.exp(rng.uniform(np.log(0.0005), np.log(0.06))))
     level = np.sqrt(np.maximum(frames, 0.02)) / 0.7 if rng.uniform() < 0.4 else 1.0
     kind, grain = str(rng.choice(["white", "smooth", "reduced"], p=[0.6, 0.2, 0.2])), rng.standard_normal(frames.shape)
