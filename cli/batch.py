@@ -85,7 +85,7 @@ def batch(
     out : Path
         The folder for the results, in place of the last word.
     preset : str
-        Settings to start from.  fast measures flow once a frame and at a quarter of the size, in two thirds of the
+        Settings to start from.  fast measures flow once a frame and at a quarter of the size, in three quarters of the
         time; paper is the method as published.  Any other setting given wins over those of the preset.
     sigma : float
         Width of the blur to remove, pixels.  Its standard deviation; 0 removes none.  Estimated by default.

@@ -57,7 +57,7 @@ def restore(
         Image to write: .png, .tif or .fits.  PNG has 8 or 16 bits, TIFF and FITS have floating point as well, and FITS
         has the header of a FITS input and the history of the run.
     preset : str
-        Settings to start from.  fast measures flow once a frame and at a quarter of the size, in two thirds of the
+        Settings to start from.  fast measures flow once a frame and at a quarter of the size, in three quarters of the
         time; paper is the method as published.  Any other setting given wins over those of the preset.
     sigma : float
         Width of the blur to remove, pixels.  Its standard deviation; 0 removes none.  Estimated by default.

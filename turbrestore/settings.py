@@ -197,7 +197,7 @@ def preset(name: Preset) -> RestoreParams:
     Parameters
     ----------
     name : {"fast", "standard", "paper"}
-        ``standard`` is ``RestoreParams()``; ``fast`` takes two thirds of its time; ``paper`` is paper 3 as it is
+        ``standard`` is ``RestoreParams()``; ``fast`` takes three quarters of its time; ``paper`` is paper 3 as it is
         printed: one warped frame as the centroid, a filter that starts after the training frames from the last of
         their states, drops the flow outside the subspace and weighs all frames alike, and a Gaussian blur.  The paper
         chooses its width by hand, ``deconvolution.sigma``; it is estimated where none is given.
