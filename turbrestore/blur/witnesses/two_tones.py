@@ -104,9 +104,8 @@ def two_tones(image: FloatArray, noise: NoiseSpectrum, exponent: float) -> TwoTo
 
 
 def _without_blur(image: FloatArray, noise: NoiseSpectrum, exponent: float) -> list[FloatArray]:
-    """Images without a blur of every width."""
-    mean = image.mean()
-    padded = np.pad(image - mean, LIMITS.tile, mode="reflect")
+    """Images, less their mean, without a blur of every width."""
+    padded = np.pad(image - image.mean(), LIMITS.tile, mode="reflect")
     spectrum = np.fft.rfft2(padded)
     nu = np.hypot(np.fft.fftfreq(padded.shape[0])[:, None], np.fft.rfftfreq(padded.shape[1]))
     power = np.maximum(nu, 1 / max(padded.shape)) ** -2
@@ -128,11 +127,11 @@ def _tiles(image: FloatArray) -> FloatArray:
 
 def _spread(tiles: FloatArray, weights: NDArray[np.floating]) -> float:
     """Return v of tiles (n, pixels), whose two levels are found by 2-means from the least and the largest value."""
-    low, high = tiles.min(axis=1), tiles.max(axis=1)
+    low, high, total = tiles.min(axis=1), tiles.max(axis=1), tiles.sum(axis=1)
     for _ in range(LIMITS.steps):
         above = tiles > ((low + high) / 2)[:, None]
         count = above.sum(axis=1)
         bright = (tiles * above).sum(axis=1)
-        high, low = bright / np.maximum(count, 1), (tiles.sum(axis=1) - bright) / np.maximum(tiles.shape[1] - count, 1)
+        high, low = bright / np.maximum(count, 1), (total - bright) / np.maximum(tiles.shape[1] - count, 1)
     nearest = np.minimum(np.square(tiles - low[:, None]), np.square(tiles - high[:, None]))
     return float((nearest.mean(axis=1) / np.maximum(np.square(high - low), ROUNDING**2)) @ weights / weights.sum())
