@@ -13,6 +13,7 @@ from turbrestore.core.errors import require
 from turbrestore.io.images.image_files import write_map
 from turbrestore.io.output import check_output
 from turbrestore.io.source import FrameSource
+from turbrestore.known_geometry import settings_of_known_flows
 from turbrestore.memory_plan import training_share
 from turbrestore.metrics import comparable
 from turbrestore.pipeline import restore as run_pipeline
@@ -20,7 +21,6 @@ from turbrestore.restoration_run import TileMap
 from turbrestore.results import Restoration
 from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.settings import Preset, RestoreParams
-from turbrestore.stacking.placement import settings_of_known_flows
 
 from .inputs import files_read, open_input, read_input_image
 from .kept import check_room, kept_stages, own_outputs

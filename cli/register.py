@@ -21,6 +21,7 @@ from turbrestore.io.npy import write_npz
 from turbrestore.io.output import atomic_output, atomic_write, check_output, check_space
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import write_video
+from turbrestore.known_geometry import settings_of_known_flows
 from turbrestore.pipeline import restore
 from turbrestore.results import Restoration
 from turbrestore.runs.run_record import describe_run
@@ -28,7 +29,6 @@ from turbrestore.runtime.memory_size import MemorySize
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.runtime.scratch import drop_pages, new_stack
 from turbrestore.settings import Preset, RestoreParams
-from turbrestore.stacking.placement import settings_of_known_flows
 from turbrestore.stacking.registered import RegisteredFrame, registered_frames
 
 from .inputs import files_read, open_input

@@ -14,8 +14,8 @@ PACKAGE = Path(__file__).parents[1] / "turbrestore"
 ORDER = [
     "core", "runtime", "display", "io", "registration", "footage", "dynamics", "filtering", "blur_moments", "blur",
     "deconvolution", "deblurring", "verification", "steady", "synthesis", "seeing", "metrics", "wording", "results",
-    "settings", "memory_plan", "runs", "preparation", "stacking", "restoration_run", "tiles", "evidence", "pipeline",
-    "report",
+    "settings", "memory_plan", "runs", "preparation", "stacking", "known_geometry", "restoration_run", "tiles",
+    "evidence", "pipeline", "report",
 ]  # fmt: skip
 LEAVES = {"blur_moments"}
 HEAVY = {"torch", "kornia", "numba", "matplotlib", "av", "imageio", "tifffile", "skimage", "rich", "PIL", "cyclopts"}

@@ -28,6 +28,7 @@ from .footage.temporal_mean import added_up, finish_mean
 from .io.images.image_files import read_image
 from .io.output import check_space
 from .io.source import FrameSource
+from .known_geometry import centroid_of_known_flows, onto_reference, settings_of_known_flows
 from .memory_plan import plan_memory
 from .preparation import prepare
 from .registration.centroid import Centroid, centroid_steps
@@ -43,7 +44,6 @@ from .runtime.scratch import drop_pages, iter_frames, mean_of, new_stack
 from .runtime.steps import Progress, finish
 from .settings import RestoreParams
 from .stacking.fine_grid import fine_image, fine_shape
-from .stacking.placement import centroid_of_known_flows, onto_reference, settings_of_known_flows
 from .tiles import centroids_of_tiles, filtered_tiles, join_centroids, join_filtered
 from .verification.pixel_deviation import SATURATED, measure_deviation, saturation_level
 from .wording import (

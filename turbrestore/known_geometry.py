@@ -17,21 +17,21 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.arrays import FloatArray, check_flow
-from ..core.decision import Decision
-from ..core.errors import DataError
-from ..filtering.alternating import Filtered
-from ..io.images.image_files import read_image
-from ..io.npy import read_npz
-from ..io.source import FrameSource
-from ..registration.centroid import Centroid, mean_registered
-from ..registration.flow_algebra import compose_flows
-from ..registration.recentring import recentring_flow
-from ..runs.stage_files import load_artifact
-from ..runtime.runtime import Runtime
-from ..runtime.scratch import fill_frames, iter_frames, new_stack
-from ..settings import RestoreParams
-from .alignment import align_to
+from .core.arrays import FloatArray, check_flow
+from .core.decision import Decision
+from .core.errors import DataError
+from .filtering.alternating import Filtered
+from .io.images.image_files import read_image
+from .io.npy import read_npz
+from .io.source import FrameSource
+from .registration.centroid import Centroid, mean_registered
+from .registration.flow_algebra import compose_flows
+from .registration.recentring import recentring_flow
+from .runs.stage_files import load_artifact
+from .runtime.runtime import Runtime
+from .runtime.scratch import fill_frames, iter_frames, new_stack
+from .settings import RestoreParams
+from .stacking.alignment import align_to
 
 
 def settings_of_known_flows(params: RestoreParams, count: int) -> RestoreParams:

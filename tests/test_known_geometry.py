@@ -7,11 +7,11 @@ import pytest
 from turbrestore.core.errors import ConfigurationError, DataError
 from turbrestore.io.images.image_files import read_image, write_image
 from turbrestore.io.video import write_video
+from turbrestore.known_geometry import settings_of_known_flows
 from turbrestore.pipeline import restore
 from turbrestore.registration.flow import estimate_flow
 from turbrestore.runs.run_files import load_run
 from turbrestore.settings import RestoreParams
-from turbrestore.stacking.placement import settings_of_known_flows
 from turbrestore.synthesis.drawn_scenes import street
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
