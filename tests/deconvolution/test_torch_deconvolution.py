@@ -39,7 +39,7 @@ class TestWeights:
         assert (pairs.tails(here)[order] == tails).all()
         assert (here.heads[order] == heads).all()
         assert root**2 == pytest.approx(here.roots[order] ** 2, rel=1e-3, abs=1e-6)
-        assert there.norm_squared == pytest.approx(here.norm_squared(), rel=1e-4)
+        assert there.norm_squared == pytest.approx(here.norm_squared(), rel=1e-5)
 
     def test_the_penalty_is_that_of_the_cpu(self, device, name):
         import torch
