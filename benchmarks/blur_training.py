@@ -3,7 +3,9 @@
 ``python benchmarks/blur_training.py make FOLDER FIRST LAST`` restores the clips of the seeds FIRST to LAST − 1
 (:mod:`blur_simulators`) up to the point where their blur is looked for, and keeps for each what the estimator then
 knows, the true transfer function, and the error of the image behind every blur that might be removed.  Clips that are
-there are kept, so it goes on where it stopped.
+there are kept, so it goes on where it stopped.  With ``--images DIR`` the scenes are parts of the images below a
+folder, such as what ``dpkg-deb -x`` unpacks of the Debian packages supertuxkart-data, plasma-workspace-wallpapers,
+gnome-backgrounds and mate-backgrounds.
 
 ``python benchmarks/blur_training.py train FOLDER [--write benchmarks/results/blur_training.md]`` trains the networks of
 :mod:`turbrestore.blur.learnt` and writes their weights.  The table is of networks that were trained without the
@@ -25,7 +27,9 @@ import cv2
 import numpy as np
 import torch
 from blur_calibration import CORE, registered
-from blur_simulators import CHAMBER, SHARES, SimulatedClip, simulate
+from blur_scenes import read_images
+from blur_simulators import CHAMBER, GIVEN, SHARES, SimulatedClip, simulate
+from numpy.typing import NDArray
 from provenance import origin, publish
 
 from turbrestore import DeconvolutionParams, TurbrestoreError, pipeline
@@ -74,11 +78,13 @@ def main() -> int:
     make.add_argument("first", type=int)
     make.add_argument("last", type=int)
     make.add_argument("--simulator", choices=[*SHARES, CHAMBER])
+    make.add_argument("--images", type=Path)
     train.add_argument("--write", type=Path)
     given = parser.parse_args()
     if given.what == "make":
         given.folder.mkdir(exist_ok=True)
-        make_clips(given.folder, given.first, given.last, given.simulator)
+        images = None if given.images is None else read_images(given.images)
+        make_clips(given.folder, given.first, given.last, given.simulator, images)
         return 0
     clips = read_clips(given.folder)
     table = table_of(clips)
@@ -91,13 +97,15 @@ def main() -> int:
     return 0
 
 
-def make_clips(folder: Path, first: int, last: int, simulator: str | None) -> None:
+def make_clips(
+    folder: Path, first: int, last: int, simulator: str | None, images: list[NDArray[np.uint8]] | None
+) -> None:
     """Simulate clips, and keep what is known of each in a file of the folder."""
     for seed in range(first, last):
-        path = folder / f"{simulator or 'any'}_{seed}.pkl"
+        path = folder / f"{simulator or (GIVEN if images else 'any')}_{seed}.pkl"
         if not path.exists():
             begun = time.perf_counter()
-            clip = simulate(seed, simulator)
+            clip = simulate(seed, simulator, images)
             found = known_of(clip)
             partial = path.with_suffix(".part")
             partial.write_bytes(pickle.dumps({"seed": seed, "simulator": clip.simulator, "scene": clip.scene, **found}))

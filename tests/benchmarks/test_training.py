@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from blur_scenes import SCENES
+from blur_scenes import SCENES, part_of_images, read_images
 from blur_simulators import simulate
 from blur_training import CORE, WIDTHS, errors_of, without_title
 
@@ -41,3 +41,32 @@ def test_a_title_neither_tells_the_blur_nor_counts_as_an_error():
     assert gains[1] > 3 and not gains[0] > 0
     faded = without_title(titled, hidden)
     assert np.ptp(faded[18:26, 34:62]) < 0.02 and abs(faded[70:, 70:] - titled[70:, 70:]).max() < 1e-3
+
+
+def test_scenes_are_parts_of_opaque_images_that_differ(tmp_path):
+    rng = np.random.default_rng(0)
+    levels = [cv2.resize(rng.integers(0, 256, (20, 20), np.uint8), (300, 260)) for _ in range(2)]
+    colour = cv2.merge([levels[1]] * 3)
+    for name, image in {
+        "a/first.png": levels[0],
+        "a/again.png": cv2.resize(levels[0], (600, 520)),
+        "b/second.png": colour,
+        "b/cut out.png": cv2.merge([255 - colour, np.zeros_like(levels[1])]),
+        "b/flat.png": np.full((300, 300), 90, np.uint8),
+        "b/small.png": 255 - levels[0][:200],
+        "b/deep.png": 257 * (255 - levels[0].astype(np.uint16)),
+    }.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        assert cv2.imwrite(str(tmp_path / name), image)
+    (tmp_path / "broken.png").write_bytes(b"no image")
+    images = read_images(tmp_path)
+    assert [image.shape for image in images] == [(520, 600), (260, 300)]
+    parts = [part_of_images(images, 180, np.random.default_rng(seed)) for seed in (1, 1, 2)]
+    assert parts[0].shape == (180, 180) and parts[0].min() >= 0 and parts[0].max() <= 1
+    assert np.array_equal(parts[0], parts[1]) and not np.array_equal(parts[0], parts[2])
+
+
+def test_the_scene_of_a_clip_is_part_of_a_given_image():
+    images = [cv2.resize(np.random.default_rng(1).integers(0, 256, (40, 40), np.uint8), (320, 320))]
+    first, second = (simulate(5, "lens", images) for _ in range(2))
+    assert first.scene == "image" and np.array_equal(first.frames, second.frames)
