@@ -18,7 +18,7 @@ import argparse
 import pickle
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from unittest.mock import patch
@@ -37,7 +37,7 @@ from turbrestore.blur import posterior
 from turbrestore.blur.learnt import FACTORS, FARTHEST, LOG_SPREADS, LearntBlur, blur_features, learnt_blur
 from turbrestore.blur.psf import GAUSSIAN, radial_otf
 from turbrestore.blur.witnesses.spectral_variation import RINGS, SIDE
-from turbrestore.blur.witnesses.two_tones import two_tones
+from turbrestore.blur.witnesses.two_tones import TwoTones, two_tones
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.noise_spectrum import NoiseSpectrum
 from turbrestore.deconvolution.deconvolve import deconvolve
@@ -205,7 +205,7 @@ class TrainingClips:
     width: np.ndarray
     gains: np.ndarray
     right: np.ndarray
-    tones: np.ndarray  # width by the two tones (n,), pixels; NaN where there are not two
+    tones: tuple[TwoTones | None, ...]  # what the two tones of each tell, if it has two or not
 
     @property
     def posterior(self) -> np.ndarray:
@@ -227,15 +227,8 @@ def read_clips(folder: Path) -> TrainingClips:
         np.maximum([clip["width"] for clip in held], WIDTHS[1]),
         gains[:, :-1],
         gains[:, -1],
-        np.array([width_by_tones(*clip["read"]) for clip in held]),
+        tuple(two_tones(clip["read"][0], clip["read"][-2], clip["read"][-1][1]) for clip in held),
     )
-
-
-def width_by_tones(image: FloatArray, *known: object) -> float:
-    """Width by the two tones of an image; NaN where it does not have two."""
-    noise, (_, exponent, *_) = known[-2:]
-    found = two_tones(image, noise, exponent)
-    return found.width if found is not None and found.clear else np.nan
 
 
 def train_networks(clips: TrainingClips, chosen: np.ndarray) -> dict[str, np.ndarray]:
@@ -332,10 +325,11 @@ def table_of(clips: TrainingClips) -> str:
 
 
 def _found(clips: TrainingClips, held: np.ndarray, weights: dict[str, np.ndarray]) -> dict[int, LearntBlur]:
-    return {
+    found = {
         place: learnt_blur(clips.features[place], clips.posterior[place], clips.alone[place], weights)
         for place in np.flatnonzero(held)
     }
+    return {place: replace(one, removed=one.chosen(clips.tones[place])) for place, one in found.items()}
 
 
 def _row(title: str, clips: TrainingClips, held: np.ndarray, found: dict[int, LearntBlur]) -> str:
@@ -356,11 +350,12 @@ def _row(title: str, clips: TrainingClips, held: np.ndarray, found: dict[int, Le
 
 def _of_tones(clips: TrainingClips, found: dict[int, LearntBlur]) -> str:
     """Sentence on the clips that have two tones, of which the networks were trained on none."""
-    places = np.flatnonzero(np.isfinite(clips.tones))
-    errors = np.log(clips.tones / clips.width)[places]
+    tones = np.array([one.width if one is not None and one.clear else np.nan for one in clips.tones])
+    places = np.flatnonzero(np.isfinite(tones))
+    errors = np.log(tones / clips.width)[places]
     removed, told = (
         np.array([_gains_at(clips.gains[place], np.array([width]))[0] for place, width in widths])
-        for widths in ([(one, found[one].removed) for one in places], [(one, clips.tones[one]) for one in places])
+        for widths in ([(one, found[one].removed) for one in places], [(one, tones[one]) for one in places])
     )
     scatter = 1.48 * np.median(np.abs(errors - np.median(errors)))
     better, worse = (told > removed + 1).sum(), (told < removed - 1).sum()

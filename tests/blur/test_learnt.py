@@ -7,8 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from turbrestore.blur.learnt import FACTORS, learnt_blur
+from turbrestore.blur.learnt import FACTORS, LearntBlur, learnt_blur
 from turbrestore.blur.posterior import BlurWitnesses, estimate_posterior, measure_witnesses
+from turbrestore.blur.witnesses.two_tones import TwoTones
 from turbrestore.core.noise_spectrum import white_noise
 from turbrestore.synthesis.scenes import SCENES
 
@@ -138,3 +139,11 @@ def test_the_file_of_the_weights_is_small_and_says_what_it_is_of():
     assert len(path.read_bytes()) < 300_000
     with path.open("rb") as stream, np.load(stream) as held:
         assert re.search(r"revision \w+, .*blur_training\.py train, \d+ clips; \| a fifth", str(held["about"]))
+
+
+def test_the_image_alone_has_a_say_where_the_scene_may_have_two_tones():
+    narrow, wide = (LearntBlur(np.array([0.8, 1.0, 1.2]) * width, 1.1, 0.9) for width in (1.0, 4.0))
+    text, photograph = TwoTones(1.0, 0.2, 0.1), TwoTones(1.0, 0.0, 0.1)
+    assert [narrow.chosen(tones) for tones in (text, photograph, None)] == [1.1, 0.9, 0.9]
+    # Behind a wide blur, tiles do not show whether a scene has two tones.
+    assert [wide.chosen(tones) for tones in (text, photograph, None)] == [1.1, 1.1, 0.9]

@@ -14,6 +14,7 @@ from turbrestore.blur.witnesses.hypotheses import hypotheses, shapes
 from turbrestore.blur.witnesses.image_evidence import image_evidence, judged_candidate
 from turbrestore.blur.witnesses.short_exposure import displacement_variance, short_exposures
 from turbrestore.blur.witnesses.spectral_variation import RINGS, SpectralVariation
+from turbrestore.blur.witnesses.two_tones import TwoTones
 from turbrestore.core.noise_spectrum import white_noise
 from turbrestore.deblurring.decisions import explain_posterior
 from turbrestore.deblurring.remove_blur import find_blur, remove_blur_steps
@@ -135,8 +136,8 @@ def test_a_wide_blur_that_stands_still_is_found(sigma):
     assert 0.4 * sigma < found.removed < 1.2 * sigma or (sigma > 6 and found.removed == 0)
 
 
-@pytest.mark.parametrize("exponent", [None, 1.7])
-def test_networks_get_the_quantiles_of_the_posterior_and_its_shape_is_removed(monkeypatch, exponent):
+@pytest.mark.parametrize(("exponent", "depth", "removed"), [(None, 0.2, 1.1), (1.7, 0.2, 1.1), (1.7, 0.05, 0.9)])
+def test_networks_get_the_quantiles_of_the_posterior_and_its_shape_is_removed(monkeypatch, exponent, depth, removed):
     frames, flows = still_clip(cv2.GaussianBlur(SCENES["camera"](128, 128), (0, 0), 1.5))
     image, given = frames.mean(axis=0), []
 
@@ -145,12 +146,13 @@ def test_networks_get_the_quantiles_of_the_posterior_and_its_shape_is_removed(mo
         return LearntBlur(np.array([1.0, 1.2, 1.4]), 1.1, 0.9)
 
     monkeypatch.setattr("turbrestore.blur.posterior.learnt_blur", learnt)
+    monkeypatch.setattr("turbrestore.blur.posterior.two_tones", lambda *_: TwoTones(1.0, depth, 0.1))
     witnesses = measure_witnesses(frames, flows, image, BlurWitnesses(0.0, 12.0))
     evidence, found = estimate_posterior(image, witnesses, white_noise(0.001), exponent=exponent)
     by_theory = blur_posterior(evidence, witnesses, witnesses.variation.with_power(image))
     np.testing.assert_array_equal(given[0], by_theory.width)
     assert given[1] == evidence.estimate.sigma > 1
-    assert found.removed == 1.1 and found.width.tolist() == [1.0, 1.2, 1.4]
+    assert found.removed == removed and found.width.tolist() == [1.0, 1.2, 1.4]
     assert np.isnan(found.by_tones).all()
     assert found.exponent == (exponent or by_theory.exponent)
     _, careful = estimate_posterior(image, witnesses, white_noise(0.001), exponent=exponent, cautious=True)

@@ -19,8 +19,9 @@ What is removed is the median of three widths: this one, its geometric mean with
 tells, which so chooses between the other two; it is 0 where the image shows no blur.  Where G expects a loss from the
 median, the narrower of the first two is removed; where G expects one from that too, nothing is.
 The networks know more simulators than the theory of the posterior, and are wrong where a clip is like none of them; the
-posterior errs elsewhere, most of all where it has two peaks.  The image alone is right about text, charts and streets,
-and takes soft scenes for blurred ones.
+posterior errs elsewhere, most of all where it has two peaks.  The image alone is right about text, charts and signs,
+and takes soft scenes for blurred ones, so that it has a say only where the scene may have two tones
+(:mod:`.witnesses.two_tones`); elsewhere the narrower of the first two widths is removed.
 ``benchmarks/decisions/blur.md`` compares them.
 
 ``python benchmarks/blur_training.py`` makes the clips, trains and judges the networks, and writes ``learnt_blur.npz``.
@@ -42,7 +43,7 @@ from ..core.noise_spectrum import NoiseSpectrum
 from .psf import Float64Array
 from .witnesses.image_evidence import ImageEvidence
 from .witnesses.spectral_variation import RINGS, SIDE, SpectralVariation, window_power, window_weights
-from .witnesses.two_tones import GRID
+from .witnesses.two_tones import GRID, TwoTones
 
 # Grid of G: widths relative to that of the posterior, the first of which is no blur.
 FACTORS: Float64Array = np.array([0, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.35, 1.6, 2.0, 2.6])
@@ -65,8 +66,13 @@ class LearntBlur:
     """What the networks say about the blur of an image, and what follows from them, the posterior and the image."""
 
     width: Float64Array  # (3,): 16 %, 50 % and 84 % quantiles of the width, pixels
-    removed: float  # width of the blur to remove, pixels; 0 if a loss is expected
+    removed: float  # width of the blur to remove if the image alone has a say, pixels; 0 if a loss is expected
     cautious: float  # the narrower of the two widths that the image alone chooses between, pixels; 0 likewise
+
+    def chosen(self, tones: TwoTones | None) -> float:
+        """Width of the blur to remove, pixels: the image alone has a say if the scene may have two tones."""
+        votes = tones is not None and tones.may_be(float(self.width[1]))
+        return self.removed if votes else self.cautious
 
 
 def blur_features(

@@ -137,7 +137,8 @@ def estimate_posterior(
 
     ``exponent`` is that of the transfer function, if it is given.  Where the image has two tones, they tell the width
     for that exponent.  Elsewhere the width is chosen for the exponent of the posterior, and is 0 where a loss is
-    expected; ``cautious`` then leaves out what the image alone tells, for callers who weigh it themselves.
+    expected; what the image alone tells then has a say if the scene may have two tones.  ``cautious`` leaves that out,
+    for callers who weigh it themselves.
     """
     evidence, variation = image_evidence(image, runtime), witnesses.variation
     ratio = None if variation is None else variation.with_power(image)
@@ -155,7 +156,7 @@ def estimate_posterior(
         told = tones.quantiles
         return evidence, replace(by_theory, removed=tones.width, exponent=shape, width=told, by_tones=told)
     found = learnt_blur(features, by_theory.width, alone)
-    removed = found.cautious if cautious else found.removed
+    removed = found.cautious if cautious else found.chosen(tones)
     return evidence, replace(by_theory, removed=removed, exponent=shape, width=found.width)
 
 
