@@ -39,13 +39,13 @@ SCENES = {"leaves": 0.25, "text": 0.14, "print": 0.1, "blades": 0.1, "bars": 0.0
 SHEET = "sheet"
 # Pixels around a clip from which displacement brings in what the frame does not show at rest.
 MARGIN = 32
-# Names of images; shortest side, least deviation of the levels, and largest share of transparent pixels of one that is
-# used, and their opacity; the side to which longer ones are reduced.
+# Names of images; least length of the shorter side, least deviation of the levels, and largest share of transparent
+# pixels of one that is used; the opacity below which a pixel is transparent; the side to which longer ones are reduced.
 SUFFIXES, SHORTEST, FLAT, CLEAR, OPAQUE, LONGEST = (".jpg", ".jpeg", ".png", ".webp"), 250, 8.0, 0.02, 200, 2400
 # Side of the thumbnails by which one image of several alike is kept, and their correlation.
 THUMBNAIL, ALIKE = 16, 0.98
-# Scales of an image, and the smallest range of them.
-SCALES, SCALED = (0.25, 1.15), 1.25
+# Scales of an image, the least ratio of the largest to the smallest, and most parts that are tried.
+SCALES, SCALED, TRIES = (0.25, 1.15), 1.25, 1000
 
 
 def draw_scene(name: str, side: int, rng: np.random.Generator) -> FloatArray:
@@ -70,7 +70,7 @@ def read_images(folder: Path) -> list[NDArray[np.uint8]]:
     found, thumbnails = list[NDArray[np.uint8]](), list[FloatArray]()
     for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file()):
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if image is None or min(image.shape[:2]) < SHORTEST or image.dtype != np.uint8:
+        if image is None or image.dtype != np.uint8:
             continue
         if image.ndim == 3 and image.shape[2] == 4 and np.mean(image[..., 3] < OPAQUE) > CLEAR:
             continue
@@ -79,7 +79,11 @@ def read_images(folder: Path) -> list[NDArray[np.uint8]]:
         grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else grey
         small = cv2.resize(np.float32(grey), (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
         small = (small - small.mean()) / max(float(small.std()), 1e-3)
-        if grey.std() >= FLAT and all(np.mean(small * other) <= ALIKE for other in thumbnails):
+        if (
+            min(grey.shape) >= SHORTEST
+            and grey.std() >= FLAT
+            and all(np.mean(small * other) <= ALIKE for other in thumbnails)
+        ):
             found.append(grey)
             thumbnails.append(small)
     return found
@@ -87,18 +91,23 @@ def read_images(folder: Path) -> list[NDArray[np.uint8]]:
 
 def part_of_images(images: list[NDArray[np.uint8]], side: int, rng: np.random.Generator) -> FloatArray:
     """Cut a square of this side out of one of the images at random scale, as a scene."""
+    for _ in range(TRIES):
+        part = _any_part(images, side, rng)
+        # Some parts show nothing but the sky.
+        if part[MARGIN:-MARGIN, MARGIN:-MARGIN].std() > FLAT / 255:
+            return _soft_or_dim(part, rng)
+    raise SystemExit(f"{TRIES} parts of {len(images)} images are all flat: give others")
+
+
+def _any_part(images: list[NDArray[np.uint8]], side: int, rng: np.random.Generator) -> FloatArray:
     whole = images[int(rng.integers(len(images)))]
     least = max(SCALES[0], (side + 1) / min(whole.shape))
     scale = float(np.exp(rng.uniform(np.log(least), np.log(max(least * SCALED, SCALES[1])))))
     length = min(int(np.ceil((side + 2) / scale)), *whole.shape)
     y, x = (int(rng.integers(0, size - length + 1)) for size in whole.shape)
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    part = np.clip(
-        cv2.resize(np.float32(whole[y : y + length, x : x + length]) / 255, (side, side), interpolation=way), 0, 1
-    )
-    # Some parts show nothing but the sky.
-    shown = part[MARGIN:-MARGIN, MARGIN:-MARGIN].std() > FLAT / 255
-    return _soft_or_dim(part, rng) if shown else part_of_images(images, side, rng)
+    part = np.float32(whole[y : y + length, x : x + length]) / 255
+    return np.asarray(np.clip(cv2.resize(part, (side, side), interpolation=way), 0, 1), np.float32)
 
 
 def _leaves(side: int, rng: np.random.Generator) -> FloatArray:

@@ -58,7 +58,7 @@ class SimulatedClip:
 
 
 def simulate(seed: int, simulator: str | None = None, images: list[NDArray[np.uint8]] | None = None) -> SimulatedClip:
-    """Draw everything about a clip from a seed, unless the simulator or the images that its scene is from are given."""
+    """Draw from a seed what is not given of a clip: its simulator, and images, of one of which its scene is a part."""
     rng = np.random.default_rng(seed)
     drawn = str(rng.choice(list(SHARES), p=list(SHARES.values())))
     simulator = simulator or drawn

@@ -18,7 +18,7 @@ import argparse
 import pickle
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from unittest.mock import patch
@@ -34,7 +34,7 @@ from provenance import origin, publish
 
 from turbrestore import DeconvolutionParams, TurbrestoreError, pipeline
 from turbrestore.blur import posterior
-from turbrestore.blur.learnt import FACTORS, FARTHEST, LOG_SPREADS, LearntBlur, blur_features, learnt_blur
+from turbrestore.blur.learnt import FACTORS, FARTHEST, LOG_SPREADS, blur_features, learnt_blur
 from turbrestore.blur.psf import GAUSSIAN, radial_otf
 from turbrestore.blur.witnesses.spectral_variation import RINGS, SIDE
 from turbrestore.blur.witnesses.two_tones import TwoTones, two_tones
@@ -63,6 +63,9 @@ NETWORKS, INNER, EPOCHS, BATCH, RATE, DECAY, DROPPED = 10, 48, 14, 128, 3e-3, 0.
 # Copies of a clip relative to other widths; deviation of the logarithm of these about the right one and the usual one.
 COPIES, NEARBY, FAR = 9, 0.3, 0.5
 
+# Quantiles of the width (3,), and the width that is removed, pixels.
+Chosen = tuple[np.ndarray, float]
+
 
 class _ReachedError(Exception):
     """Ends a restoration where the blur has been found."""
@@ -83,7 +86,11 @@ def main() -> int:
     given = parser.parse_args()
     if given.what == "make":
         given.folder.mkdir(exist_ok=True)
+        if given.images is not None and given.simulator == CHAMBER:
+            parser.error(f"--simulator {CHAMBER} draws its own scenes: leave out --images")
         images = None if given.images is None else read_images(given.images)
+        if images is not None and not images:
+            parser.error(f"--images: expected images below a folder, found none below {given.images}")
         make_clips(given.folder, given.first, given.last, given.simulator, images)
         return 0
     clips = read_clips(given.folder)
@@ -102,7 +109,7 @@ def make_clips(
 ) -> None:
     """Simulate clips, and keep what is known of each in a file of the folder."""
     for seed in range(first, last):
-        path = folder / f"{simulator or (GIVEN if images else 'any')}_{seed}.pkl"
+        path = folder / f"{'' if images is None else GIVEN + '_'}{simulator or 'any'}_{seed}.pkl"
         if not path.exists():
             begun = time.perf_counter()
             clip = simulate(seed, simulator, images)
@@ -205,7 +212,7 @@ class TrainingClips:
     width: np.ndarray
     gains: np.ndarray
     right: np.ndarray
-    tones: tuple[TwoTones | None, ...]  # what the two tones of each tell, if it has two or not
+    tones: tuple[TwoTones | None, ...]  # what the two tones of each tell, whether or not it has two
 
     @property
     def posterior(self) -> np.ndarray:
@@ -305,7 +312,7 @@ def table_of(clips: TrainingClips) -> str:
     ]
     rng = np.random.default_rng(0)
     folds = rng.integers(0, 5, len(clips.simulators))
-    found: dict[int, LearntBlur] = {}
+    found: dict[int, Chosen] = {}
     for name in sorted(set(clips.simulators)):
         held = clips.simulators == name
         weights = train_networks(clips, ~held)
@@ -324,21 +331,21 @@ def table_of(clips: TrainingClips) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _found(clips: TrainingClips, held: np.ndarray, weights: dict[str, np.ndarray]) -> dict[int, LearntBlur]:
+def _found(clips: TrainingClips, held: np.ndarray, weights: dict[str, np.ndarray]) -> dict[int, Chosen]:
     found = {
         place: learnt_blur(clips.features[place], clips.posterior[place], clips.alone[place], weights)
         for place in np.flatnonzero(held)
     }
-    return {place: replace(one, removed=one.chosen(clips.tones[place])) for place, one in found.items()}
+    return {place: (one.width, one.chosen(clips.tones[place])) for place, one in found.items()}
 
 
-def _row(title: str, clips: TrainingClips, held: np.ndarray, found: dict[int, LearntBlur]) -> str:
+def _row(title: str, clips: TrainingClips, held: np.ndarray, found: dict[int, Chosen]) -> str:
     places = np.flatnonzero(held)
-    quantiles = np.log([found[place].width for place in places])
+    quantiles = np.log([found[place][0] for place in places])
     true, wide = np.log(clips.width[places]), clips.width[places] > 0.6
     error = (quantiles[:, 1] - true)[wide]
     within = ((true >= quantiles[:, 0]) & (true <= quantiles[:, 2])).mean()
-    removed = np.array([_gains_at(clips.gains[place], np.array([found[place].removed]))[0] for place in places])
+    removed = np.array([_gains_at(clips.gains[place], np.array([found[place][1]]))[0] for place in places])
     best = clips.gains[places].max(1).mean()
     size = np.abs(error) if error.size else np.array([np.nan])
     return (
@@ -348,14 +355,14 @@ def _row(title: str, clips: TrainingClips, held: np.ndarray, found: dict[int, Le
     )
 
 
-def _of_tones(clips: TrainingClips, found: dict[int, LearntBlur]) -> str:
+def _of_tones(clips: TrainingClips, found: dict[int, Chosen]) -> str:
     """Sentence on the clips that have two tones, of which the networks were trained on none."""
     tones = np.array([one.width if one is not None and one.clear else np.nan for one in clips.tones])
     places = np.flatnonzero(np.isfinite(tones))
     errors = np.log(tones / clips.width)[places]
     removed, told = (
         np.array([_gains_at(clips.gains[place], np.array([width]))[0] for place, width in widths])
-        for widths in ([(one, found[one].removed) for one in places], [(one, tones[one]) for one in places])
+        for widths in ([(one, found[one][1]) for one in places], [(one, tones[one]) for one in places])
     )
     scatter = 1.48 * np.median(np.abs(errors - np.median(errors)))
     better, worse = (told > removed + 1).sum(), (told < removed - 1).sum()

@@ -69,4 +69,6 @@ def test_scenes_are_parts_of_opaque_images_that_differ(tmp_path):
 def test_the_scene_of_a_clip_is_part_of_a_given_image():
     images = [cv2.resize(np.random.default_rng(1).integers(0, 256, (40, 40), np.uint8), (320, 320))]
     first, second = (simulate(5, "lens", images) for _ in range(2))
+    other = simulate(5, "lens", [255 - images[0]])
     assert first.scene == "image" and np.array_equal(first.frames, second.frames)
+    assert np.corrcoef(first.truth.ravel(), other.truth.ravel())[0, 1] < -0.9

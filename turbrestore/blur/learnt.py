@@ -15,13 +15,13 @@ widths; widths are relative to that of the posterior, which is about right at ev
 scatter adds to the deviation.  Of the widths whose G is as good as the largest, but for a difference that is not seen,
 the widest is chosen that is no wider than σ or than the best.
 
-What is removed is the median of three widths: this one, its geometric mean with σ_16, and the one that the image alone
-tells, which so chooses between the other two; it is 0 where the image shows no blur.  Where G expects a loss from the
-median, the narrower of the first two is removed; where G expects one from that too, nothing is.
+What is removed is the narrower of two widths, this one and its geometric mean with σ_16.  Where the scene may have two
+tones, or the blur is too wide to tell (:mod:`.witnesses.two_tones`), it is the median of these and of the width that
+the image alone tells, which so chooses between the two; that is 0 where the image shows no blur.  Where G expects a
+loss from the median, the narrower of the two is removed; where G expects one from that too, nothing is.
 The networks know more simulators than the theory of the posterior, and are wrong where a clip is like none of them; the
 posterior errs elsewhere, most of all where it has two peaks.  The image alone is right about text, charts and signs,
-and takes soft scenes for blurred ones, so that it has a say only where the scene may have two tones
-(:mod:`.witnesses.two_tones`); elsewhere the narrower of the first two widths is removed.
+and takes textures and soft scenes for blurred ones.
 ``benchmarks/decisions/blur.md`` compares them.
 
 ``python benchmarks/blur_training.py`` makes the clips, trains and judges the networks, and writes ``learnt_blur.npz``.
@@ -66,13 +66,13 @@ class LearntBlur:
     """What the networks say about the blur of an image, and what follows from them, the posterior and the image."""
 
     width: Float64Array  # (3,): 16 %, 50 % and 84 % quantiles of the width, pixels
-    removed: float  # width of the blur to remove if the image alone has a say, pixels; 0 if a loss is expected
+    median: float  # width of the blur to remove if the image alone has a say, pixels; 0 if a loss is expected
     cautious: float  # the narrower of the two widths that the image alone chooses between, pixels; 0 likewise
 
     def chosen(self, tones: TwoTones | None) -> float:
         """Width of the blur to remove, pixels: the image alone has a say if the scene may have two tones."""
         votes = tones is not None and tones.may_be(float(self.width[1]))
-        return self.removed if votes else self.cautious
+        return self.median if votes else self.cautious
 
 
 def blur_features(

@@ -13,6 +13,9 @@ v(σ) : spread about the two levels of a tile relative to their distance, the me
     ``min((u − a)², (u − b)²) / (b − a)²`` over its pixels and over the tiles, weighted by their variances in f
 d : depth of the least v, ``ln v(σ) − ln v`` from the narrowest σ that is tried, at which u is nearly f
 
+Scenes that only resemble one of two tones do not tell the width this way, but the likelihood of their gradients does
+(:mod:`turbrestore.blur.learnt`).
+
 The filter passes ``H / (H² + N / S)`` with the spectrum N of the noise; the power S of the scene falls as ν^−2, as that
 of photographs does (Field 1987), and its mean is the variance of f.
 
@@ -50,11 +53,14 @@ class _Thresholds:
     # Least depth d of a scene of two tones, and its largest v.
     depth: float = threshold(0.45, "1", "measured: gains 0.8 dB on the 27 clips above; loses 0.5 dB from 0.40 to 0.45")
     spread: float = threshold(1 / 24, "1", "theory: half of the v of a ramp")
-    # d from which a scene resembles one of two tones, and width of a blur from which tiles do not show it.
+    # d from which a scene resembles one of two tones, and the width of a blur beyond which tiles do not show whether it
+    # does.
     resembling: float = threshold(
-        0.1, "1", "measured: with it 1,579 clips gain 1.20 dB; 1.21 at 0.05, 1.20 at 0.15, 1.18 at 0"
+        0.1, "1", "measured: 1,579 clips gain 1.20 dB, 396 others 0.56; 1.20 and 0.56 at 0.05, 1.19 and 0.57 at 0.15"
     )
-    unseen: float = threshold(3.0, "pixels", "theory: full width at half maximum is half of a tile at 3.4 pixels")
+    unseen: float = threshold(
+        3.0, "pixels", "theory: the width at half maximum is half of a tile at 3.4 pixels; less, to be safe"
+    )
     # The width that is told over that of the least v, and the deviation of its logarithm.
     width: float = threshold(0.95, "1", "measured: 0.90 and 0.95 gain 0.8 dB, 1.00 gains 0.5")
     deviation: float = threshold(0.12, "1", "measured: scatter of the minimum over the true width on these clips")
