@@ -52,6 +52,7 @@ TABLES = {
     "robustness": Table("robustness.py"),
     "ablation": Table("ablation.py --clips drawn_* ao_camera_medium"),
     "blur_calibration": Table("blur_calibration.py {scratch}"),
+    "blur_training": Table("blur_training.py train"),
     "quality": Table("quality.py"),
     "filter": Table("filter.py ao_camera_medium purdue1_brick_strong quick_chart_weak"),
     "dynamics": Table("dynamics.py"),
@@ -70,7 +71,6 @@ TABLES = {
     "history": Table("history.py", timed=True),
     "tvl1": Table("tvl1.py --quick", timed=True),
     "memory": Table("memory.py --quick", timed=True),
-    "blur_training": Table("blur_training.py", missing=lambda: "its clips take hours, and its networks are kept"),
     "device": Table("device.py --device cuda --size 1080 1920 --frames 100 --runs 1", timed=True, missing=_gpu),
 }
 

@@ -7,20 +7,26 @@ there are kept, so it goes on where it stopped.  With ``--images DIR`` the scene
 folder, such as what ``dpkg-deb -x`` unpacks of the Debian packages supertuxkart-data, plasma-workspace-wallpapers,
 gnome-backgrounds and mate-backgrounds.
 
-``python benchmarks/blur_training.py train FOLDER [--write benchmarks/results/blur_training.md]`` trains the networks of
-:mod:`turbrestore.blur.learnt` and writes their weights.  The table is of networks that were trained without the
-simulator on which they are judged.
+``python benchmarks/blur_training.py keep FOLDER`` adds to ``blur_training.npz``, beside this program, what of these
+clips the networks are trained on and judged by, so that they can be trained without making the clips again; where what
+the estimator knows has changed, all have to be made anew.
+
+``python benchmarks/blur_training.py train [--write benchmarks/results/blur_training.md] [--weights FILE]`` trains the
+networks of :mod:`turbrestore.blur.learnt` on the clips that are kept, and judges networks that were trained without the
+simulator, or without the fifth of the clips, on which they are judged.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import pickle
 import sys
 import time
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import cv2
@@ -44,7 +50,7 @@ from turbrestore.deconvolution.deconvolve import deconvolve
 from turbrestore.deconvolution.problem import largest_width
 from turbrestore.runtime.runtime import Runtime
 
-WEIGHTS = Path(__file__).resolve().parent.parent / "turbrestore" / "blur" / "learnt_blur.npz"
+KEPT = Path(__file__).resolve().with_suffix(".npz")
 # Mean squared error that is invisible; gains, dB, below which all losses count alike in the table, and in training,
 # where the best widths are to be told apart and not the worst; unit of the networks, dB.
 INVISIBLE, WORST, HARMFUL, UNIT = 10**-3.8, -8.0, -4.0, 3.0
@@ -75,14 +81,15 @@ def main() -> int:
     """Make clips, or train and judge networks."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     kinds = parser.add_subparsers(dest="what", required=True)
-    make, train = kinds.add_parser("make"), kinds.add_parser("train")
-    for kind in (make, train):
+    make, keep, train = (kinds.add_parser(name) for name in ("make", "keep", "train"))
+    for kind in (make, keep):
         kind.add_argument("folder", type=Path)
     make.add_argument("first", type=int)
     make.add_argument("last", type=int)
     make.add_argument("--simulator", choices=[*SHARES, CHAMBER])
     make.add_argument("--images", type=Path)
     train.add_argument("--write", type=Path)
+    train.add_argument("--weights", type=Path)
     given = parser.parse_args()
     if given.what == "make":
         given.folder.mkdir(exist_ok=True)
@@ -93,14 +100,18 @@ def main() -> int:
             parser.error(f"--images: expected images below a folder, found none below {given.images}")
         make_clips(given.folder, given.first, given.last, given.simulator, images)
         return 0
-    clips = read_clips(given.folder)
+    if given.what == "keep":
+        keep_clips(given.folder, KEPT)
+        return 0
+    clips = kept_clips(KEPT)
     table = table_of(clips)
     publish(table, given.write)
-    every = train_networks(clips, np.ones(len(clips.simulators), bool))
-    scores = next(line for line in table.splitlines() if line.startswith("| a fifth |"))
-    about = f"{origin()} python benchmarks/blur_training.py train, {len(clips.simulators)} clips; {scores}"
-    weights = {name: values.astype(np.float16) for name, values in every.items()}
-    np.savez_compressed(WEIGHTS, about=about, **weights)
+    if given.weights is not None:
+        every = train_networks(clips, np.ones(len(clips.names), bool))
+        scores = next(line for line in table.splitlines() if line.startswith("| a fifth |"))
+        about = f"{origin()} python benchmarks/blur_training.py train, {len(clips.names)} clips; {scores}"
+        weights = {name: values.astype(np.float16) for name, values in every.items()}
+        np.savez_compressed(given.weights, about=about, **weights)
     return 0
 
 
@@ -145,6 +156,8 @@ def known_of(clip: SimulatedClip) -> dict[str, object]:
     if "read" not in known:
         return {"refused": "no blur is looked for"}
     image, noise = known["read"][0], known["read"][5]
+    if image.shape != clip.truth.shape:
+        return {"refused": "its dark border is cut off"}
     truth = registered(known["levels"].stretched(clip.truth), image)
     width, exponent = fitted_blur(*(without_title(one, clip.hidden) for one in (image, truth)))
     seen, usual = ~clip.hidden[CORE], blur_features(*known["read"])[SHAPE]
@@ -204,37 +217,69 @@ def fitted_blur(image: FloatArray, truth: FloatArray) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class TrainingClips:
-    """Features (n, f), widths by the image alone and true ones (n,), gains, dB, by WIDTHS (n, w) and the truth (n,)."""
+    """What networks are trained on and judged by."""
 
-    simulators: np.ndarray
-    features: np.ndarray
-    alone: np.ndarray
-    width: np.ndarray
-    gains: np.ndarray
-    right: np.ndarray
-    tones: tuple[TwoTones | None, ...]  # what the two tones of each tell, whether or not it has two
+    names: np.ndarray  # of files (n,)
+    simulators: np.ndarray  # (n,)
+    features: np.ndarray  # (n, f)
+    alone: np.ndarray  # widths by the image alone (n,), pixels; 0 where it finds no blur
+    width: np.ndarray  # true widths (n,), pixels
+    gains: np.ndarray  # by WIDTHS (n, w), decibels
+    right: np.ndarray  # gains by the true blur (n,), decibels
+    two_tones: np.ndarray  # fields of TwoTones (n, 3), whether or not there are two tones; NaN where nothing is told
 
     @property
     def posterior(self) -> np.ndarray:
         """Quantiles of the posterior (n, 3), pixels."""
         return np.exp(self.features[:, POSTERIOR])
 
+    @property
+    def tones(self) -> list[TwoTones | None]:
+        """What the two tones of each clip tell."""
+        return [None if np.isnan(row).any() else TwoTones(*row.tolist()) for row in self.two_tones]
 
-def read_clips(folder: Path) -> TrainingClips:
-    """Read the clips of a folder whose blur was looked for."""
-    held = [pickle.loads(path.read_bytes()) for path in sorted(folder.glob("*.pkl"))]
-    held = [clip for clip in held if "errors" in clip]
-    errors = np.array([[*clip["errors"], clip["right"]] for clip in held])
-    visible = -10 * np.log10(errors + INVISIBLE)
-    gains = np.maximum(np.nan_to_num(visible - visible[:, :1], nan=WORST), WORST)
+
+def keep_clips(folder: Path, path: Path) -> None:
+    """Add the clips of a folder whose blur was looked for to those that are kept in a file, in place of namesakes."""
+    read = {one.stem: _row_of(one.stem, pickle.loads(one.read_bytes())) for one in sorted(folder.glob("*.pkl"))}
+    rows = {name: row for name, row in read.items() if row is not None}
+    fields = [field.name for field in dataclasses.fields(TrainingClips)]
+    if path.exists():
+        before = kept_clips(path)
+        columns = [getattr(before, field) for field in fields]
+        rows = dict(zip(before.names, zip(*columns, strict=True), strict=True)) | rows
+    ordered = [rows[name] for name in sorted(rows)]
+    kept = {field: np.array(column) for field, column in zip(fields, zip(*ordered, strict=True), strict=True)}
+    # Eleven bits are less than the networks tell apart.
+    kept = {field: values.astype(np.float16) if values.dtype.kind == "f" else values for field, values in kept.items()}
+    np.savez_compressed(path, about=f"{origin()} python benchmarks/blur_training.py keep", **kept)
+
+
+def kept_clips(path: Path) -> TrainingClips:
+    """Read the clips that are kept in a file."""
+    with np.load(path, allow_pickle=False) as held:
+        values = {name: held[name] for name in held.files if name != "about"}
     return TrainingClips(
-        np.array([clip["simulator"] for clip in held]),
-        np.array([blur_features(*clip["read"]) for clip in held]),
-        np.array([one.sigma * one.blurred for one in (clip["read"][4].estimate for clip in held)]),
-        np.maximum([clip["width"] for clip in held], WIDTHS[1]),
-        gains[:, :-1],
-        gains[:, -1],
-        tuple(two_tones(clip["read"][0], clip["read"][-2], clip["read"][-1][1]) for clip in held),
+        **{name: each.astype(float) if each.dtype.kind == "f" else each for name, each in values.items()}
+    )
+
+
+def _row_of(name: str, clip: dict[str, Any]) -> tuple[object, ...] | None:
+    """Fields of TrainingClips for a clip; None if its blur was not looked for."""
+    if "errors" not in clip:
+        return None
+    visible = -10 * np.log10(np.array([*clip["errors"], clip["right"]]) + INVISIBLE)
+    gains = np.maximum(np.nan_to_num(visible - visible[0], nan=WORST), WORST)
+    read, estimate = clip["read"], clip["read"][4].estimate
+    return (
+        name,
+        clip["simulator"],
+        blur_features(*read),
+        estimate.sigma * estimate.blurred,
+        max(clip["width"], WIDTHS[1]),
+        gains[:-1],
+        gains[-1],
+        two_tones(read[0], read[-2], read[-1][1]) or np.full(len(TwoTones._fields), np.nan),
     )
 
 
@@ -301,7 +346,7 @@ def table_of(clips: TrainingClips) -> str:
     lines = [
         "# Blur that is learnt",
         "",
-        "Made by `python benchmarks/blur_training.py train FOLDER --write benchmarks/results/blur_training.md`.",
+        "Made by `python benchmarks/blur_training.py train --write benchmarks/results/blur_training.md`.",
         "",
         "Error of ln width where the blur exceeds .6 px, and share of true widths within the 68 % interval; gain in",
         "visible error (MSE plus that of 38 dB), dB, by the best width, by the true blur, and what is removed;",
@@ -312,7 +357,7 @@ def table_of(clips: TrainingClips) -> str:
     ]
     rng = np.random.default_rng(0)
     folds = rng.integers(0, 5, len(clips.simulators))
-    found: dict[int, Chosen] = {}
+    found = dict[int, Chosen]()
     for name in sorted(set(clips.simulators)):
         held = clips.simulators == name
         weights = train_networks(clips, ~held)
@@ -332,11 +377,12 @@ def table_of(clips: TrainingClips) -> str:
 
 
 def _found(clips: TrainingClips, held: np.ndarray, weights: dict[str, np.ndarray]) -> dict[int, Chosen]:
+    posterior, tones = clips.posterior, clips.tones
     found = {
-        place: learnt_blur(clips.features[place], clips.posterior[place], clips.alone[place], weights)
+        place: learnt_blur(clips.features[place], posterior[place], clips.alone[place], weights)
         for place in np.flatnonzero(held)
     }
-    return {place: (one.width, one.chosen(clips.tones[place])) for place, one in found.items()}
+    return {place: (one.width, one.chosen(tones[place])) for place, one in found.items()}
 
 
 def _row(title: str, clips: TrainingClips, held: np.ndarray, found: dict[int, Chosen]) -> str:

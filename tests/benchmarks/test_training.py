@@ -1,11 +1,13 @@
-"""Clips from which the blur is learnt, and what a title hides of them."""
+"""Clips from which the blur is learnt, what is kept of them, and what a title hides of them."""
+
+import pickle
 
 import cv2
 import numpy as np
 import pytest
 from blur_scenes import SCENES, part_of_images, read_images
 from blur_simulators import simulate
-from blur_training import CORE, WIDTHS, errors_of, without_title
+from blur_training import CORE, INVISIBLE, KEPT, WIDTHS, errors_of, keep_clips, kept_clips, known_of, without_title
 
 from turbrestore.core.noise_spectrum import white_noise
 
@@ -72,3 +74,36 @@ def test_the_scene_of_a_clip_is_part_of_a_given_image():
     other = simulate(5, "lens", [255 - images[0]])
     assert first.scene == "image" and np.array_equal(first.frames, second.frames)
     assert np.corrcoef(first.truth.ravel(), other.truth.ravel())[0, 1] < -0.9
+
+
+def test_what_networks_are_trained_on_is_kept(leaves, tmp_path):
+    clip, kept = simulate(3, "lens"), tmp_path / "kept.npz"
+    known = {"simulator": clip.simulator, **known_of(clip)}
+    for folder, clips in {
+        "first": {"a": known, "b": known, "c": {"simulator": "lens", "refused": "too short"}},
+        "second": {"b": {**known, "width": 3.0}, "d": known},
+    }.items():
+        (tmp_path / folder).mkdir()
+        for name, one in clips.items():
+            (tmp_path / folder / f"{name}.pkl").write_bytes(pickle.dumps(one))
+        keep_clips(tmp_path / folder, kept)
+    found = kept_clips(kept)
+    assert found.names.tolist() == ["a", "b", "d"] and set(found.simulators) == {"lens"}
+    np.testing.assert_allclose(found.width, [known["width"], 3.0, known["width"]], rtol=1e-3)
+    visible = -10 * np.log10(known["errors"] + INVISIBLE)
+    # The gain of the second width that is tried, and none of no blur.
+    np.testing.assert_allclose(found.gains[:, :2], [[0, visible[1] - visible[0]]] * 3, atol=1e-2)
+    assert np.ptp(found.features, axis=0)[np.isfinite(found.features[0])].max() == 0
+
+
+def test_the_clips_that_are_kept_are_of_every_simulator():
+    clips = kept_clips(KEPT)
+    assert {*clips.simulators} == {"screens", "kernels", "lens", "mixed", "near", "none", "close", "chamber"}
+    assert len(clips.names) == len({*clips.names}) >= 1000 and KEPT.stat().st_size < 4e6
+    assert (clips.width >= WIDTHS[1]).all() and np.isfinite(clips.gains).all() and not clips.gains[:, 0].any()
+
+
+def test_a_clip_whose_dark_border_is_cut_off_teaches_nothing(leaves):
+    clip = simulate(3, "lens")
+    clip.frames[:, :24] = clip.truth[:24] = 0
+    assert known_of(clip) == {"refused": "its dark border is cut off"}
