@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 from methods.packages import NETWORKS, PackageError, make_environment
@@ -38,11 +39,15 @@ class Table:
     missing: Callable[[], str] = lambda: ""
 
 
+def _torch() -> str:
+    return "" if find_spec("torch") else "torch is not installed"
+
+
 def _gpu() -> str:
-    try:
-        import torch
-    except ImportError:
-        return "torch is not installed"
+    if reason := _torch():
+        return reason
+    import torch
+
     return "" if torch.cuda.is_available() else "there is no GPU"
 
 
@@ -52,8 +57,8 @@ TABLES = {
     "robustness": Table("robustness.py"),
     "ablation": Table("ablation.py --clips drawn_* ao_camera_medium"),
     "blur_calibration": Table("blur_calibration.py {scratch}"),
-    "blur_training": Table("blur_training.py train"),
     "quality": Table("quality.py"),
+    "blur_training": Table("blur_training.py train", missing=_torch),
     "filter": Table("filter.py ao_camera_medium purdue1_brick_strong quick_chart_weak"),
     "dynamics": Table("dynamics.py"),
     "oracles": Table("oracles.py"),

@@ -7,13 +7,14 @@ there are kept, so it goes on where it stopped.  With ``--images DIR`` the scene
 folder, such as what ``dpkg-deb -x`` unpacks of the Debian packages supertuxkart-data, plasma-workspace-wallpapers,
 gnome-backgrounds and mate-backgrounds.
 
-``python benchmarks/blur_training.py keep FOLDER`` adds to ``blur_training.npz``, beside this program, what of these
-clips the networks are trained on and judged by, so that they can be trained without making the clips again; where what
-the estimator knows has changed, all have to be made anew.
+``python benchmarks/blur_training.py keep FOLDER`` stores the features and gains of these clips in
+``blur_training.npz``, with which ``train`` needs no clips.  After a change to anything that comes before the networks,
+all clips have to be made again.
 
-``python benchmarks/blur_training.py train [--write benchmarks/results/blur_training.md] [--weights FILE]`` trains the
-networks of :mod:`turbrestore.blur.learnt` on the clips that are kept, and judges networks that were trained without the
-simulator, or without the fifth of the clips, on which they are judged.
+``python benchmarks/blur_training.py train [--write benchmarks/results/blur_training.md]
+[--weights turbrestore/blur/learnt_blur.npz]`` judges networks that were trained without the simulator, or without the
+fifth of the clips, on which they are judged; the fifths are drawn by clip, so that parts of one photograph may be on
+both sides.  With ``--weights`` it also trains the networks of :mod:`turbrestore.blur.learnt` on all clips.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ class _ReachedError(Exception):
 
 
 def main() -> int:
-    """Make clips, or train and judge networks."""
+    """Make or keep clips, or train and judge networks."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     kinds = parser.add_subparsers(dest="what", required=True)
     make, keep, train = (kinds.add_parser(name) for name in ("make", "keep", "train"))
@@ -101,8 +102,12 @@ def main() -> int:
         make_clips(given.folder, given.first, given.last, given.simulator, images)
         return 0
     if given.what == "keep":
+        if not any(given.folder.glob("*.pkl")):
+            parser.error(f"expected clips in {given.folder}, found none: `make` makes them")
         keep_clips(given.folder, KEPT)
         return 0
+    if given.weights is not None and (given.weights.suffix != ".npz" or not given.weights.parent.is_dir()):
+        parser.error(f"--weights: expected a .npz file in a folder that exists, found {given.weights}")
     clips = kept_clips(KEPT)
     table = table_of(clips)
     publish(table, given.write)
@@ -110,8 +115,7 @@ def main() -> int:
         every = train_networks(clips, np.ones(len(clips.names), bool))
         scores = next(line for line in table.splitlines() if line.startswith("| a fifth |"))
         about = f"{origin()} python benchmarks/blur_training.py train, {len(clips.names)} clips; {scores}"
-        weights = {name: values.astype(np.float16) for name, values in every.items()}
-        np.savez_compressed(given.weights, about=about, **weights)
+        _save(given.weights, about, every)
     return 0
 
 
@@ -240,19 +244,31 @@ class TrainingClips:
 
 
 def keep_clips(folder: Path, path: Path) -> None:
-    """Add the clips of a folder whose blur was looked for to those that are kept in a file, in place of namesakes."""
+    """Add the clips of a folder to those that are kept in a file, in place of namesakes.
+
+    A clip that was refused, because nothing looks for its blur, is not kept.
+    """
     read = {one.stem: _row_of(one.stem, pickle.loads(one.read_bytes())) for one in sorted(folder.glob("*.pkl"))}
-    rows = {name: row for name, row in read.items() if row is not None}
     fields = [field.name for field in dataclasses.fields(TrainingClips)]
+    rows: dict[str, dict[str, Any] | None] = {}
     if path.exists():
         before = kept_clips(path)
-        columns = [getattr(before, field) for field in fields]
-        rows = dict(zip(before.names, zip(*columns, strict=True), strict=True)) | rows
-    ordered = [rows[name] for name in sorted(rows)]
-    kept = {field: np.array(column) for field, column in zip(fields, zip(*ordered, strict=True), strict=True)}
-    # Eleven bits are less than the networks tell apart.
-    kept = {field: values.astype(np.float16) if values.dtype.kind == "f" else values for field, values in kept.items()}
-    np.savez_compressed(path, about=f"{origin()} python benchmarks/blur_training.py keep", **kept)
+        rows = {name: {field: getattr(before, field)[at] for field in fields} for at, name in enumerate(before.names)}
+    kept = [row for _, row in sorted((rows | read).items()) if row is not None]
+    _save(path, f"{origin()} python benchmarks/blur_training.py keep", _columns(kept, fields))
+
+
+def _columns(rows: list[dict[str, Any]], fields: list[str]) -> dict[str, np.ndarray]:
+    return {field: np.array([row[field] for row in rows]) for field in fields}
+
+
+def _save(path: Path, about: str, columns: dict[str, np.ndarray]) -> None:
+    """Save arrays in half precision, and what they are."""
+    # That rounds features by less than 1 % of their scale; training adds noise of 5 %.
+    half = {name: each.astype(np.float16) if each.dtype.kind == "f" else each for name, each in columns.items()}
+    partial = path.with_suffix(".part.npz")
+    np.savez_compressed(partial, about=about, **half)
+    partial.replace(path)
 
 
 def kept_clips(path: Path) -> TrainingClips:
@@ -264,23 +280,24 @@ def kept_clips(path: Path) -> TrainingClips:
     )
 
 
-def _row_of(name: str, clip: dict[str, Any]) -> tuple[object, ...] | None:
-    """Fields of TrainingClips for a clip; None if its blur was not looked for."""
+def _row_of(name: str, clip: dict[str, Any]) -> dict[str, Any] | None:
+    """Fields of TrainingClips for a clip; None if it was refused."""
     if "errors" not in clip:
         return None
     visible = -10 * np.log10(np.array([*clip["errors"], clip["right"]]) + INVISIBLE)
     gains = np.maximum(np.nan_to_num(visible - visible[0], nan=WORST), WORST)
     read, estimate = clip["read"], clip["read"][4].estimate
-    return (
-        name,
-        clip["simulator"],
-        blur_features(*read),
-        estimate.sigma * estimate.blurred,
-        max(clip["width"], WIDTHS[1]),
-        gains[:-1],
-        gains[-1],
-        two_tones(read[0], read[-2], read[-1][1]) or np.full(len(TwoTones._fields), np.nan),
-    )
+    tones = two_tones(read[0], read[-2], read[-1][1])
+    return {
+        "names": name,
+        "simulators": clip["simulator"],
+        "features": blur_features(*read),
+        "alone": estimate.sigma * estimate.blurred,
+        "width": max(clip["width"], WIDTHS[1]),
+        "gains": gains[:-1],
+        "right": gains[-1],
+        "two_tones": np.full(len(TwoTones._fields), np.nan) if tones is None else np.array(tones),
+    }
 
 
 def train_networks(clips: TrainingClips, chosen: np.ndarray) -> dict[str, np.ndarray]:

@@ -9,6 +9,8 @@ from blur_scenes import SCENES, part_of_images, read_images
 from blur_simulators import simulate
 from blur_training import CORE, INVISIBLE, KEPT, WIDTHS, errors_of, keep_clips, kept_clips, known_of, without_title
 
+from turbrestore.blur.learnt import blur_features
+from turbrestore.blur.witnesses.two_tones import two_tones
 from turbrestore.core.noise_spectrum import white_noise
 
 
@@ -78,10 +80,10 @@ def test_the_scene_of_a_clip_is_part_of_a_given_image():
 
 def test_what_networks_are_trained_on_is_kept(leaves, tmp_path):
     clip, kept = simulate(3, "lens"), tmp_path / "kept.npz"
-    known = {"simulator": clip.simulator, **known_of(clip)}
+    known, refused = {"simulator": clip.simulator, **known_of(clip)}, {"simulator": "lens", "refused": "too short"}
     for folder, clips in {
-        "first": {"a": known, "b": known, "c": {"simulator": "lens", "refused": "too short"}},
-        "second": {"b": {**known, "width": 3.0}, "d": known},
+        "first": {"a": known, "b": known, "c": refused, "e": known},
+        "second": {"b": {**known, "width": 3.0}, "d": known, "e": refused},
     }.items():
         (tmp_path / folder).mkdir()
         for name, one in clips.items():
@@ -90,10 +92,14 @@ def test_what_networks_are_trained_on_is_kept(leaves, tmp_path):
     found = kept_clips(kept)
     assert found.names.tolist() == ["a", "b", "d"] and set(found.simulators) == {"lens"}
     np.testing.assert_allclose(found.width, [known["width"], 3.0, known["width"]], rtol=1e-3)
-    visible = -10 * np.log10(known["errors"] + INVISIBLE)
-    # The gain of the second width that is tried, and none of no blur.
-    np.testing.assert_allclose(found.gains[:, :2], [[0, visible[1] - visible[0]]] * 3, atol=1e-2)
-    assert np.ptp(found.features, axis=0)[np.isfinite(found.features[0])].max() == 0
+    visible = -10 * np.log10(np.array([*known["errors"][:2], known["right"]]) + INVISIBLE)
+    # Gains of no blur, of the second width that is tried, and of the true blur.
+    gains = np.column_stack([found.gains[:, :2], found.right])
+    np.testing.assert_allclose(gains, [visible - visible[0]] * 3, atol=1e-2)
+    read, estimate = known["read"], known["read"][4].estimate
+    np.testing.assert_allclose(found.features, [blur_features(*read)] * 3, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(found.alone, [estimate.sigma * estimate.blurred] * 3, rtol=1e-3)
+    np.testing.assert_allclose(found.tones[0], two_tones(read[0], read[5], read[6][1]), rtol=1e-3, atol=1e-3)
 
 
 def test_the_clips_that_are_kept_are_of_every_simulator():
@@ -101,6 +107,9 @@ def test_the_clips_that_are_kept_are_of_every_simulator():
     assert {*clips.simulators} == {"screens", "kernels", "lens", "mixed", "near", "none", "close", "chamber"}
     assert len(clips.names) == len({*clips.names}) >= 1000 and KEPT.stat().st_size < 4e6
     assert (clips.width >= WIDTHS[1]).all() and np.isfinite(clips.gains).all() and not clips.gains[:, 0].any()
+    # The networks of the package read the same features.
+    with np.load(KEPT.parent.parent / "turbrestore" / "blur" / "learnt_blur.npz") as weights:
+        assert clips.features.shape[1] == len(weights["middle"]) and not np.isinf(clips.features).any()
 
 
 def test_a_clip_whose_dark_border_is_cut_off_teaches_nothing(leaves):

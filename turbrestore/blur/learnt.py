@@ -24,7 +24,8 @@ posterior errs elsewhere, most of all where it has two peaks.  The image alone i
 and takes textures and soft scenes for blurred ones.
 ``benchmarks/decisions/blur.md`` compares them.
 
-``python benchmarks/blur_training.py`` makes the clips, trains and judges the networks, and writes ``learnt_blur.npz``.
+``python benchmarks/blur_training.py`` makes the clips, trains and judges the networks, and with ``--weights`` writes
+``learnt_blur.npz``.
 """
 
 from __future__ import annotations

@@ -36,7 +36,8 @@ from ...core.noise_spectrum import NoiseSpectrum
 from ...core.thresholds import threshold
 from ..psf import Float64Array, blur_otf
 
-# Widths that are tried, pixels.  The networks read at these too, so that others ask for networks trained anew.
+# Widths that are tried, pixels.  The networks read at these too, so that others ask for networks that are trained anew
+# on clips that are made anew.
 GRID: Float64Array = np.geomspace(0.3, 9.0, 14)
 
 
@@ -44,8 +45,9 @@ GRID: Float64Array = np.geomspace(0.3, 9.0, 14)
 class _Thresholds:
     """What tells a scene of two tones from others.
 
-    Measured on 1,731 training clips of ``benchmarks/blur_training.py``, of which about 27 have two tones; its table has
-    those of the last training.  Gains are over the width that networks choose which were not trained on the clip.
+    Measured on 1,731 training clips of ``benchmarks/blur_training.py``, of which about 27 have two tones.  Gains are
+    over the width that networks choose which were not trained on the clip; ``benchmarks/decisions/blur.md`` has those
+    over the networks of today.
     """
 
     # Side of a tile: a letter or some bars.
