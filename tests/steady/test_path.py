@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from turbrestore.steady.camera_path.path import LONGEST, _alikeness, smooth_motion
+from turbrestore.steady.camera_path.path import LONGEST, _models, smooth_motion
 from turbrestore.steady.displacement import camera_steadiness, displacement_sizes, whole_displacement
 
 SHAPE = (120, 160)
@@ -30,15 +30,31 @@ def steadied(shifts, velocity=0.0, numbers=None):
     return np.array(ends)
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.5, 0.8])
-def test_residuals_that_are_alike_count_as_fewer(correlation):
-    shifts = wander(4000, correlation, np.random.default_rng(0))
-    left = np.zeros((len(shifts), 2, 3))
-    left[..., 2] = shifts
-    expected = np.sqrt((1 + correlation) / (1 - correlation))
-    for every in (1, 2):
-        times = np.arange(0, len(shifts), every)
-        assert _alikeness(times, left[times].reshape(-1, 6)) == pytest.approx(expected, rel=0.1)
+def test_weights_and_evidence_are_those_of_a_gaussian_process_with_a_wide_prior_of_the_constant():
+    times = (-9, -6, -3, -2, -1, 0, 1, 2, 5)
+    models, time, wide = _models(times), np.array(times, float), 1e7
+    y, number = np.random.default_rng(0).standard_normal(len(times)), 0
+    cameras = [*((line, walk, None) for line, walk in ((0, 0), (5, 0), (5, 1e-6), (5, 1e-4), (5, 1e-2), (5, 1.0)))]
+    cameras += [(5, 0, turn) for turn in range(-6, 7)]
+    for correlated in (1.0, 3.0, 9.0):
+        air = np.exp(-np.abs(time[:, None] - time) / correlated)
+        for line, walk, turn in cameras:
+            steps = np.linspace(0, 9, 9001)
+            # An integrated random walk is the sum of its steps, each of which moves all that comes later.
+            ahead = np.clip(np.abs(time)[:, None] - steps, 0, None)
+            same_side = np.sign(time[:, None]) == np.sign(time)
+            camera = line**2 * np.outer(time, time) + walk * same_side * (ahead @ ahead.T) * (steps[1] - steps[0])
+            if turn is not None:
+                later = np.where((time > turn) if turn >= 0 else (time < turn), np.abs(time - turn), 0)
+                camera = camera + line**2 * np.outer(later, later)
+            total = wide + camera + air
+            assert models.here[number] @ y == pytest.approx(wide * np.linalg.solve(total, y).sum(), abs=1e-3)
+            assert y @ models.left[number] @ y == pytest.approx(y @ np.linalg.solve(total, y), rel=1e-3)
+            prior = -np.log(4 if walk else 1 if turn is None else 13)
+            evidence = prior - (np.linalg.slogdet(total)[1] - np.log(wide)) / 2
+            assert models.evidence[number] == pytest.approx(evidence, abs=1e-2)
+            number += 1
+    assert number == len(models.evidence) == 3 * len(cameras)
 
 
 def test_slow_wander_of_whole_frames_is_averaged_over_the_longest_path():

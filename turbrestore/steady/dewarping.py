@@ -27,10 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
-from ..core.errors import DataError
 from ..core.noise import estimate_noise
-from ..registration.camera.global_shift import LEAST_CORRELATION, correlation, measure_shift
-from ..registration.flow import MIN_SIDE
+from ..registration.camera.global_shift import LEAST_CORRELATION, ShiftReference, correlation, measure_shift
 from ..registration.flow_methods.opencv_flow import DisParams, GreyImage, dis_solver
 from ..registration.warp import sample_splines
 from .camera_path.camera import Matrix, camera_flow, fit_camera
@@ -48,9 +46,9 @@ from .displacement import (
     witnesses,
 )
 from .fusion import fuse
-from .grid import enlarged, follow, grid_of, inverted, pixel_of
+from .grid import enlarged, follow, grid_of, inverted, pixel_of, reduced
 from .settings import SteadyParams
-from .windows import Window, WindowFrame, light_between, normalised_image, relit
+from .windows import Window, WindowFrame, light_between, normalised_grey, relit
 
 # Patches this sparse lose nothing on phase screens; closer ones take a fifth longer.
 _FLOW = DisParams(finest_scale=0, patch_size=8, patch_stride=4, refinements=1, smoothness=10.0)
@@ -99,7 +97,7 @@ def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
         removed_camera = (
             smooth_motion(cameras, whole_displacement(size, largest), shape)
             if params.camera == "keep"
-            else without_shake(cameras, order=params.camera == "steady")
+            else without_shake(cameras, order=int(params.camera == "steady"))
         )
         path = path_length(own)
         displacement = mean_displacement(own, largest, path, pixel_of(shape))
@@ -137,12 +135,20 @@ def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
     )
 
 
-def measure_flow(reference: FloatArray, image: FloatArray, start: FloatArray) -> FloatArray:
+def measure_flow(
+    reference: FloatArray, image: FloatArray, start: FloatArray, shape: tuple[int, ...] | None = None
+) -> FloatArray:
     """Flow between two images on their grid, searched for near where it starts.
 
-    ``reference, image`` (H, W) or (H, W, 3); ``start`` (h, w, 2); returns (h, w, 2).
+    ``reference, image`` (H, W) or (H, W, 3), or with their ``shape`` luminance (h, w) on the grid; ``start`` (h, w, 2);
+    returns (h, w, 2).
     """
-    return _solver(normalised_image(reference), reference.shape)(normalised_image(image), start)
+    shape = shape or reference.shape
+    normalised = [
+        normalised_grey(luminance(one if one.shape[:2] == grid_of(shape) else reduced(one)), shape)
+        for one in (reference, image)
+    ]
+    return _solver(normalised[0], shape)(normalised[1], start)
 
 
 def _solver(normalised: GreyImage, shape: tuple[int, ...]) -> Callable[[GreyImage, FloatArray], FloatArray]:
@@ -157,9 +163,6 @@ def _measure(window: Window) -> tuple[dict[int, FloatArray], dict[int, Matrix]]:
     as it went to the one before.
     """
     normalised, shape = window.frame.normalised, window.frame.image.shape
-    if min(shape[:2]) < MIN_SIDE:
-        found = f"{shape[1]}×{shape[0]}"
-        raise DataError(f"frames: expected at least {MIN_SIDE}×{MIN_SIDE} pixels for optical flow, found {found}")
     solve = _solver(normalised, shape)
     flows: dict[int, FloatArray] = {}
     cameras: dict[int, Matrix] = {}
@@ -168,19 +171,19 @@ def _measure(window: Window) -> tuple[dict[int, FloatArray], dict[int, Matrix]]:
         if any(offset * other > 0 for other in cameras):
             expected = expected_motion(cameras, offset)
         else:
-            expected = _first_guess(window.frame, neighbour)
+            expected = first_guess(window.frame.shift_reference, neighbour.shift_reference, neighbour.image)
         flows[offset] = solve(neighbour.normalised, camera_flow(expected, shape, normalised.shape))
         cameras[offset] = fit_camera(flows[offset], shape)
     return flows, cameras
 
 
-def _first_guess(frame: WindowFrame, neighbour: WindowFrame) -> Matrix:
-    """Find a shift of the whole frame, where the images are not alike without one.
+def first_guess(reference: ShiftReference, prepared: ShiftReference, image: FloatArray) -> Matrix:
+    """Find a shift (2, 3) of a whole image, given as it is and prepared, where the two are not alike without one.
 
     A pattern that repeats looks as much alike a period further on, and more so through some turbulence.
     """
-    still = correlation(frame.shift_reference.reduced, neighbour.shift_reference.reduced)
-    shift = None if still > LEAST_CORRELATION else measure_shift(neighbour.image, frame.shift_reference)
+    still = correlation(reference.reduced, prepared.reduced)
+    shift = None if still > LEAST_CORRELATION else measure_shift(image, reference)
     return np.column_stack([np.zeros((2, 2)), np.zeros(2) if shift is None else shift])
 
 

@@ -30,6 +30,12 @@ moves by g R, and the memory with it: ``Z ← Z ∘ (id + V)`` with V the invers
 is an error of the path or of the memory, and the output must not drift away from the input.  Where r cannot be trusted
 (w small, an object or the background it uncovers) it is filled in from around.
 
+Where the mean M of the frames before and after frame k is known (:mod:`turbrestore.steady.scene_mean`), Z goes there
+instead: V is the inverse flow of ``g_r m``, m the flow from Z to ``M ∘ S⁻¹ E⁻¹`` with S the map from frame k to the
+steadied one, filled in likewise.  M averages three times as many frames as the displacement of a frame does, and no
+error of the flow to a single frame is in it.  A frame that begins a memory, as every frame of a camera that shakes, is
+placed by the whole of m, as far as turbulence is strong.
+
 A memory that has gone astray, because a period of a pattern was taken for another or the scene moves slowly, may still
 agree with every next frame.  It is therefore checked against the mean B of the luminance of the last frames, which the
 camera alone carries along and no flow: with e_Z and e_F the distances of Z and of ``F ∘ N E⁻¹`` from B, squared and
@@ -51,8 +57,11 @@ from ..registration.warp import inside, sample_linear, warp
 from .camera_path.camera import Matrix, camera_flow, fit_camera
 from .camera_path.path import motion
 from .fusion import agreement_weight, explained_difference, for_channels
-from .grid import enlarged, grid_of, inverted, pixel_of, reduced
+from .grid import enlarged, follow, grid_of, inverted, pixel_of, reduced
 from .windows import coarse_image, light_between, relit
+
+# Flow between two images (h, w, 2): reference, image, where the search starts, shape of the frames.
+Flow = Callable[..., FloatArray]
 
 # Longest memory, frames: a change of the light is followed as fast.
 _LONGEST = 64
@@ -91,31 +100,40 @@ class Memory:
     replaced: float  # share of the image that the last frame replaced because it differed from B
 
 
+@dataclass(frozen=True, eq=False)
+class Around:
+    """Mean of the frames before and after a frame, in which it is placed."""
+
+    image: FloatArray  # (h, w): M, luminance on the grid, at the position of the frame
+    share: FloatArray  # (h, w): how far M is known, 0 to 1
+    back: Matrix  # (3, 3): from the steadied frame to the frame
+    largest: float  # what turbulence displaces at most, pixels, however the camera moves
+
+
 def remember(
     memory: Memory | None,
     image: FloatArray,
-    flow_between: Callable[[FloatArray, FloatArray, FloatArray], FloatArray],
+    flow_between: Flow,
     noise: float,
     largest: float,
     steadiness: float,
     moving: NDArray[np.bool_],
     carry: Matrix,
     offset: Matrix,
+    around: Around | None = None,
 ) -> Memory:
     """Take a frame into the memory, which :func:`shown` then gives as the estimate of this frame.
 
     ``image`` (H, W) or (H, W, 3); ``moving`` (H, W); ``carry, offset`` (3, 3).
     """
     shape = image.shape[:2]
-    steadiness *= float(np.clip((largest - _WEAK) / (_STRONG - _WEAK), 0, 1))
+    steadiness *= _strength(largest)
     if memory is None or steadiness < _LEAST_STEADINESS:
-        distances = np.zeros((*shape, 2), np.float32)
-        return Memory(image, np.ones(shape, np.float32), 1, np.eye(3), luminance(image), distances, 0.0)
+        return _begun(image, flow_between, noise, moving, offset, around)
     memory = _carried(memory, carry, offset, image)
-    start = offset @ np.linalg.inv(memory.pose)
-    expected = motion(start)
+    expected = motion(offset @ np.linalg.inv(memory.pose))
     grid, pixel = grid_of(shape), pixel_of(shape)
-    flow = flow_between(memory.image, image, camera_flow(expected, shape, grid))
+    flow = flow_between(memory.image, image, camera_flow(expected, shape, grid), shape)
     camera = fit_camera(flow, shape)
     own = flow - camera_flow(camera, shape, grid)
     memory = _in_light(memory, coarse_image(warp(image, camera_flow(expected, shape))))
@@ -125,23 +143,83 @@ def remember(
     agrees = 1 / (1 + (distances[..., 0] / (distances[..., 1] + _EVEN)) ** 4)
     tolerance = explained_difference(memory.image, noise)
     weight = agreement_weight(sample_linear((image,), enlarged(flow, shape)), memory.image, tolerance)
-    weight /= 1 + (cv2.GaussianBlur(np.einsum("yxc,yxc->yx", own, own), (0, 0), _WINDOW / pixel) / largest**2) ** 2
+    weight *= _turbulent(own, largest, pixel)
     # R follows a slow object from frame to frame, and would hold it back, and with it the flat background beside it.
-    near = cv2.dilate(moving.astype(np.uint8), _MARGIN) > 0
-    weight *= reduced((1 - cv2.GaussianBlur(near.astype(np.float32), (0, 0), _MARGIN_EDGE)) * agrees)
-    beside = reduced(cv2.dilate(near.astype(np.uint8), _BESIDE).astype(np.float32))
-    own = _filled(own, np.where(beside > 0, 0, weight), pixel)
+    near, beside = _beside(moving)
+    weight *= reduced((1 - cv2.GaussianBlur(near, (0, 0), _MARGIN_EDGE)) * agrees)
+    own = _filled(own, np.where(beside, 0, weight), pixel)
     frames = min(memory.frames + 1, _LONGEST)
     kept = steadiness * (1 - 1 / frames)
     held = 1 + enlarged(weight, shape) * np.minimum(memory.held, kept / (1 - kept))
     innovation = warp(image, enlarged(own, shape) + camera_flow(camera, shape)) - memory.image
     innovation /= for_channels(held, image)
-    pulled = camera_flow(max(1 - kept, _PULL) * (camera - expected), shape, grid)
-    inverse = enlarged(inverted((1 - kept) * own + pulled, shape), shape)
+    if around is None:
+        drift = camera_flow(max(1 - kept, _PULL) * (camera - expected), shape, grid) + np.float32(1 - kept) * own
+    else:
+        drift = np.float32(1 - kept) * _off_mean(memory.image, memory.pose, around, flow_between, beside, tolerance)
+    inverse = enlarged(inverted(drift, shape), shape)
     mean = memory.mean + (placed - memory.mean) / np.float32(min(frames, _RECENT))
     replaced = float(1 - agrees.mean())
     estimate = warp(memory.image + innovation, inverse)
     return Memory(estimate, sample_linear((held,), inverse), frames, memory.pose, mean, distances, replaced)
+
+
+def _begun(
+    image: FloatArray,
+    flow_between: Flow,
+    noise: float,
+    moving: NDArray[np.bool_],
+    offset: Matrix,
+    around: Around | None,
+) -> Memory:
+    """Begin a memory with a frame, placed in the mean of the frames around it as far as there is turbulence."""
+    shape = image.shape[:2]
+    if around is not None and (strength := _strength(around.largest)):
+        to_steadied = camera_flow(motion(offset), shape)
+        steadied = warp(image, to_steadied)
+        tolerance, beside = explained_difference(steadied, noise), _beside(moving)[1]
+        off = _off_mean(steadied, np.eye(3), around, flow_between, beside, tolerance)
+        image = warp(image, np.float32(strength) * (to_steadied + enlarged(inverted(off, shape), shape)))
+    distances = np.zeros((*shape, 2), np.float32)
+    return Memory(image, np.ones(shape, np.float32), 1, np.eye(3), luminance(image), distances, 0.0)
+
+
+def _off_mean(
+    image: FloatArray,
+    pose: Matrix,
+    around: Around,
+    flow_between: Flow,
+    beside: NDArray[np.bool_],
+    tolerance: FloatArray,
+) -> FloatArray:
+    """Flow from an image at a pose to the mean of the frames around, filled in where it cannot be trusted."""
+    shape = image.shape[:2]
+    grid, pixel = grid_of(shape), pixel_of(shape)
+    to_frame = motion(around.back @ np.linalg.inv(pose))
+    there, seen = camera_flow(to_frame, shape, grid), reduced(luminance(image))
+    mean, share = follow(around.image, there, shape), follow(around.share, there, shape)
+    mean = relit(mean, light_between(coarse_image(mean), coarse_image(seen)))
+    mean = seen + share * (mean - seen)
+    flow = flow_between(image, mean, np.zeros((*grid, 2), np.float32), shape)
+    weight = agreement_weight(follow(mean, flow, shape), seen, tolerance) * _turbulent(flow, around.largest, pixel)
+    return _filled(flow, np.where(beside, 0, weight * share), pixel)
+
+
+def _strength(largest: float) -> float:
+    """Tell how much the memory counts, 0 where turbulence is weak and 1 where it is strong."""
+    return float(np.clip((largest - _WEAK) / (_STRONG - _WEAK), 0, 1))
+
+
+def _turbulent(flow: FloatArray, largest: float, pixel: float) -> FloatArray:
+    """Weight of a flow (h, w, 2), less where it is longer than turbulence displaces."""
+    square = cv2.GaussianBlur(np.einsum("yxc,yxc->yx", flow, flow), (0, 0), _WINDOW / pixel)
+    return np.asarray(1 / (1 + (square / largest**2) ** 2), np.float32)
+
+
+def _beside(moving: NDArray[np.bool_]) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Give what moves a margin (H, W), and mark the flat background on the grid whose flow it draws along."""
+    near = cv2.dilate(moving.astype(np.uint8), _MARGIN)
+    return near.astype(np.float32), reduced(cv2.dilate(near, _BESIDE).astype(np.float32)) > 0
 
 
 def _in_light(memory: Memory, seen: FloatArray) -> Memory:

@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from itertools import chain, islice
+from itertools import chain, islice, repeat
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,10 +38,11 @@ from .camera_path.camera import Matrix, camera_flow, fit_camera
 from .camera_path.path import LONGEST, camera_position, homogeneous, longer_path, motion, smooth_motion
 from .deblurring import deblur
 from .dewarping import DewarpedFrame, dewarp_frame, measure_flow
-from .displacement import whole_displacement
+from .displacement import largest_displacement, whole_displacement
 from .fusion import for_channels, share_of_estimate
 from .grid import enlarged, follow, grid_of, pixel_of, reduced
-from .memory import Memory, remember, shown
+from .memory import Around, Memory, remember, shown
+from .scene_mean import SceneMean, iter_scene_means
 from .settings import SteadyParams
 from .windows import Window, iter_windows, relit
 
@@ -92,6 +93,10 @@ def steady_frames(
 ) -> Iterator[SteadyFrame]:
     """Steady a stream of frames, one output frame for each input frame.
 
+    Frames that can be read twice, as those of an array, a list or :func:`turbrestore.open_frames`, are placed in the
+    mean of up to 48 frames before and after them.  An iterator cannot, and its frames are placed by those before them
+    and ``params.reach`` frames after them, which leaves turbulence that moves the whole image slowly.
+
     The output lags behind the input by ``params.reach`` frames and two for each thread, and at the start by half of
     ``params.reach`` more, because the blur is estimated there; with ``params.live`` by two frames.  Memory does not
     grow with the length of the stream.
@@ -99,7 +104,7 @@ def steady_frames(
     Parameters
     ----------
     frames : iterable of array_like, shape (H, W) or (H, W, 3)
-        Intensities in [0, 1]; consumed lazily.
+        Intensities in [0, 1]; consumed lazily, twice unless it is an iterator.
     params : SteadyParams, optional
         Settings.
     runtime : Runtime
@@ -136,11 +141,14 @@ def steady_frames(
     scenes = _Scenes(params, width, said, runtime)
     if head:
         scenes.keep_title(head[-1])
+    # An iterator cannot be read twice.
+    means = repeat(None) if isinstance(frames, Iterator) else iter_scene_means(frames)
+    placed = zip(chain(head, windows), means, strict=False)
     yield from map_in_turns(
-        lambda window: dewarp_frame(window, params),
-        lambda frame: (frame, scenes.estimate(frame)),
+        lambda pair: (dewarp_frame(pair[0], params), pair[1]),
+        lambda pair: (pair[0], scenes.estimate(*pair)),
         lambda pair: _sharpened(*pair, width, exponent),
-        chain(head, windows),
+        placed,
         runtime.threads,
     )
 
@@ -157,7 +165,7 @@ def _one_by_one(windows: Iterable[Window], params: SteadyParams, runtime: Runtim
                     sigma, exponent, said = _find_first(window, params, runtime)
                     scenes.remove(sigma, said)
             frame = dewarp_frame(window, params)
-            yield _sharpened(frame, scenes.estimate(frame), sigma, exponent)
+            yield _sharpened(frame, scenes.estimate(frame, None), sigma, exponent)
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,18 +245,29 @@ class _Scenes:
         )
         self._title = find_title(take_survey(clip))
 
-    def estimate(self, frame: DewarpedFrame) -> tuple[Memory, NDArray[np.bool_], float, Title | None]:
+    def estimate(
+        self, frame: DewarpedFrame, mean: SceneMean | None
+    ) -> tuple[Memory, NDArray[np.bool_], float, Title | None]:
         """Estimate of the scene at a frame, what moves, the width of the blur of what is remembered, and the title."""
         if frame.starts_scene:
             self._memory, self._width, self._found = None, self._first, None
             self._positions.clear()
-        carry, offset = self._follow(frame)
+        carry, offset, around = self._follow(frame, mean)
         image, moving = frame.image, frame.moving
         if self._params.camera != "keep":
             image, moving = _placed(image, moving, offset)
             offset = np.eye(3)
         self._memory = remember(
-            self._memory, image, measure_flow, frame.noise, frame.largest, frame.steadiness, moving, carry, offset
+            self._memory,
+            image,
+            measure_flow,
+            frame.noise,
+            frame.largest,
+            frame.steadiness,
+            moving,
+            carry,
+            offset,
+            around,
         )
         estimate = shown(self._memory)
         if self._params.camera == "keep":
@@ -257,9 +276,10 @@ class _Scenes:
             self._title = self._title.at_rest(frame.seen.image, frame.noise)
         return estimate, moving, self._remembered_width(self._memory), self._title
 
-    def _follow(self, frame: DewarpedFrame) -> tuple[Matrix, Matrix]:
-        """Follow the camera: maps from the steadied frame to the one before, and to the dewarped frame."""
-        position, shape = camera_position(self._positions, frame.cameras), frame.moving.shape
+    def _follow(self, frame: DewarpedFrame, mean: SceneMean | None) -> tuple[Matrix, Matrix, Around | None]:
+        """Follow the camera: maps from the steadied frame to the one before, and to the dewarped frame; its place."""
+        shape = frame.moving.shape
+        position = camera_position(self._positions, frame.cameras) if mean is None else mean.position
         dewarped = homogeneous(frame.removed_camera)
         if self._params.camera == "lock":
             if not self._positions:
@@ -269,14 +289,17 @@ class _Scenes:
             steadied = dewarped
         else:
             tolerance = whole_displacement(frame.size, frame.largest)
-            path = longer_path(self._positions, position, frame.cameras)
+            path = longer_path(self._positions, position, frame.cameras) if mean is None else mean.path
             steadied = homogeneous(smooth_motion(path, tolerance, shape))
         back, carry = np.linalg.inv(steadied), np.eye(3)
         if self._positions:
             carry = self._steadied @ self._positions[-1] @ np.linalg.inv(position) @ back
         self._positions.append(position)
         self._steadied = steadied
-        return carry, dewarped @ back
+        if mean is None:
+            return carry, dewarped @ back, None
+        largest = self._params.largest or largest_displacement(frame.size, 1.0)
+        return carry, dewarped @ back, Around(mean.image, mean.share, back, largest)
 
     def _remembered_width(self, memory: Memory) -> float:
         """Width to remove from what is remembered, which gradually becomes the one that its own image needs."""

@@ -19,7 +19,7 @@ from ..core.arrays import FloatArray, check_stream, check_unit_image, luminance
 from ..core.errors import DataError
 from ..footage.checks.scene_cuts import similarity_at, thumbnail
 from ..registration.camera.global_shift import ShiftReference, prepare_shift_reference
-from ..registration.flow import normalise_to_8_bits
+from ..registration.flow import MIN_SIDE, normalise_to_8_bits
 from ..registration.flow_methods.opencv_flow import GreyImage
 from ..runtime.image_stacks import spline_planes
 from .grid import pixel_of, reduced
@@ -86,12 +86,31 @@ def iter_windows(
         yield _window(kept, first, number, offsets)
 
 
-def normalised_image(image: FloatArray) -> GreyImage:
-    """Normalise the local contrast of an image on its grid, from which flow is measured.
+def iter_scenes(frames: Iterable[ArrayLike]) -> Iterator[tuple[FloatArray, int]]:
+    """Yield every frame (H, W) or (H, W, 3) with the number of its scene, from 0.
 
-    ``image`` (H, W) or (H, W, 3); returns (h, w).
+    Raises DataError for a frame that differs from the first in size, is too small for flow, or is no image.
     """
-    return _normalised(luminance(reduced(image)), image.shape)
+    scene, before, shape = 0, None, None
+    for number, values in enumerate(check_stream(frames)):
+        image = check_unit_image(values, f"frame {number}")
+        shape = shape or image.shape
+        if image.shape != shape:
+            raise DataError(f"frame {number}: expected shape {shape} as the first frame, found {image.shape}")
+        if min(shape[:2]) < MIN_SIDE:
+            found = f"{shape[1]}×{shape[0]}"
+            raise DataError(f"frames: expected at least {MIN_SIDE}×{MIN_SIDE} pixels for optical flow, found {found}")
+        detail = thumbnail(image)
+        detail = detail - cv2.GaussianBlur(detail, (0, 0), _SHADING)
+        if before is not None and np.any(before) and np.any(detail):
+            scene += similarity_at(detail, before)[0] < _CUT
+        before = detail
+        yield image, scene
+
+
+def normalised_grey(grey: FloatArray, shape: tuple[int, ...]) -> GreyImage:
+    """Normalise the local contrast of the luminance (h, w) of an image of this shape on its grid."""
+    return normalise_to_8_bits(grey, _CONTRAST_WINDOW / pixel_of(shape), _CONTRAST_FLOOR)
 
 
 def coarse_image(image: FloatArray) -> FloatArray:
@@ -142,10 +161,6 @@ def relit(image: FloatArray, gain: FloatArray) -> FloatArray:
     return scaled.reshape(image.shape)
 
 
-def _normalised(grey: FloatArray, shape: tuple[int, ...]) -> GreyImage:
-    return normalise_to_8_bits(grey, _CONTRAST_WINDOW / pixel_of(shape), _CONTRAST_FLOOR)
-
-
 def _window(kept: deque[WindowFrame], first: int, number: int, offsets: Sequence[int]) -> Window:
     place = number - first
     frame = kept[place]
@@ -158,18 +173,8 @@ def _window(kept: deque[WindowFrame], first: int, number: int, offsets: Sequence
 
 
 def _prepared(frames: Iterable[ArrayLike]) -> Iterator[WindowFrame]:
-    scene, before, shape = 0, None, None
-    for number, values in enumerate(check_stream(frames)):
-        image = check_unit_image(values, f"frame {number}")
-        shape = shape or image.shape
-        if image.shape != shape:
-            raise DataError(f"frame {number}: expected shape {shape} as the first frame, found {image.shape}")
-        detail = thumbnail(image)
-        detail = detail - cv2.GaussianBlur(detail, (0, 0), _SHADING)
-        if before is not None and np.any(before) and np.any(detail):
-            scene += similarity_at(detail, before)[0] < _CUT
-        before = detail
+    for image, scene in iter_scenes(frames):
         grey = luminance(reduced(image))
-        normalised = _normalised(grey, image.shape)
+        normalised = normalised_grey(grey, image.shape)
         shift_reference = prepare_shift_reference(image)
         yield WindowFrame(image, spline_planes(image), grey, normalised, coarse_image(image), scene, shift_reference)

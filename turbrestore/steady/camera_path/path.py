@@ -2,57 +2,57 @@
 
 Symbols
 -------
-k : the frame; j a frame before it, or after it within the window
+k : the frame; j a frame before it or after it, at time t_j, frames after k
 G_j : affine map from the first frame of the scene to frame j, homogeneous, pixels about the centre of the image
 P_j : motion of the camera from frame k to frame j, ``G_j G_k⁻¹ − 1``, of shape (2, 3)
-T : map from frame k to the steadied frame, ``1 +`` the value at k of a curve fitted to the P_j
+y : one of the six coefficients of all P_j, scaled to the root mean square of what it moves, pixels; ``y = c + a``
+c, a : the part of the camera, and that of turbulence, which moves whole frames as well
+s², τ : variance of a, and its correlation time, frames: covariance ``s² R``, ``R_ij = exp(−|t_i − t_j| / τ)``
+s² C : covariance of c about a constant that is not known
+V : ``R + C``; Q : ``V⁻¹ − V⁻¹ 1 1ᵀ V⁻¹ / 1ᵀ V⁻¹ 1``
 e : by what turbulence moves whole frames, pixels
-ε_i, σ_i : what fit i leaves, root mean square; standard deviation of its value at k, from ε_i and ρ_i
-ρ_i : correlation of what fit i leaves in successive frames: a mean varies √((1 + ρ) / (1 − ρ)) times as much by it
-n : number of frames of the first fit; S : sum of squares that one of its curves leaves
+T : map from frame k to the steadied frame, ``1 +`` the mean of c_k, given the P_j
 
-Turbulence moves whole frames as well, but at random about where the camera is, and a camera rests, pans and zooms at
-constant velocity for a while.  A curve through a few frames follows whatever the camera does and averages little; a
-line through many averages much, without a lag behind a pan; a mean of many is best while the camera rests.  The fits
-are taken in this order, as long as each agrees with the one before (the intersection of confidence intervals of
-Goldenshluger and Nemirovski 1997): fit i has the share ::
+A camera rests (C = 0), moves at constant velocity (``C = v² t tᵀ``), turns once (``C = v² (t tᵀ + h hᵀ)``, h the
+distance in time from the turn on, zero at frame k), or changes its velocity at random by a variance of ρ s² a frame
+(``C = v² t tᵀ + ρ W``, W the covariance of an integrated random walk from frame k on).  The evidence for such a model,
+with s² integrated out by the prior 1/s², is::
 
-    Π_{l ≤ i} 1 / (1 + (ε_l / e)⁸) · 1 / (1 + (|value_l − value_{l−1}| / κ σ_{l−1})⁴)
+    |V|^(−1/2) (1ᵀ V⁻¹ 1)^(−1/2) (yᵀ Q y)^(−(n − 1)/2)
 
-of what those before leave, without the last factor for the first.  Where even the first leaves more than e, the camera
-shakes, and T = 1.
-
-The path of a camera that turns is a parabola, that of one which starts or stops at once two lines that meet, at any
-frame with two others on either side.  The first fit is the mean of these curves by their probability, ε_1 that of the
-parabola.  All have three coefficients along each axis, so where what they leave is independent and of unknown scatter,
-their likelihoods are ``S^(3 − n)``; a priori, the parabola is as probable as all pairs of lines together.  σ_1 includes
-by how much the curves differ at k.
+(Rasmussen and Williams 2006, ch. 2.7 and 5.4; Wahba 1978 for W), and under it the mean of c_k is
+``1ᵀ V⁻¹ y / 1ᵀ V⁻¹ 1``, since C is zero at frame k.  T is the mean over models and correlation times by their
+probability.  Each coefficient has its own, and the others have a say on the correlation time.  Of a model counts the
+share ``1 / (1 + (s / e)⁸)`` only, with ``s² = yᵀ Q y / (n − 1)``: what moves frames further than turbulence does is a
+camera that shakes, and stays as it is.
 
 G_j is the median over the earlier neighbours of frame j of the map to them and on to frame j; those far away keep
-errors from adding up with every frame.
+errors from adding up with every frame.  Where the frames can be read twice, they are placed in the mean of the scene
+instead (:mod:`turbrestore.steady.scene_mean`).
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from .camera import Matrix, camera_size
 
-# Frames before k that are kept.
+# Frames before k, and after it, that are kept.
 LONGEST = 48
-# Fits: frames on either side of k, and order of the polynomial, which of the second order has pairs of lines beside it;
-# fewest frames of a fit.
-_FITS = (6, 2), (6, 1), (12, 1), (24, 1), (LONGEST, 1), (LONGEST, 0)
+# Correlation times τ, frames, and ρ of the models: closer and wider grids give the same paths.
+_TIMES, _WALKS = (1.0, 3.0, 9.0), (1e-6, 1e-4, 1e-2, 1.0)
+# v, a frame: velocities and their changes are of this order times s.  Three times as much or a third changes paths by
+# 4 %, less rounds a sudden stop.  Frames from k at which a camera may turn.
+_VELOCITY, _TURNS = 5.0, tuple(range(-6, 7))
+# Distance up to which every frame counts, and every how many frames further away: those are as alike as they are many.
+_NEAR, _EVERY = 12, 3
 _FEWEST = 4
-# κ, less for a static camera, since that is the assumption that a slow pan breaks.
-_DOUBT, _RESTING = 2.0, 1.5
-_AT_ENDS = 0.5
-# Frames from one to the next whose residuals are compared, and the greatest correlation ρ that they count for.
-_SUCCESSIVE, _MOST_ALIKE = 2, 0.95
-# Least e, ε and κ σ, pixels, so that an exact fit has a share.
-_LEAST = 1e-3
+# Error of a position, pixels, which scatters at random, and least e.
+_ERROR, _LEAST = 0.03, 1e-3
 
 
 def camera_position(before: Sequence[Matrix], cameras: Mapping[int, Matrix]) -> Matrix:
@@ -77,35 +77,29 @@ def longer_path(before: Sequence[Matrix], position: Matrix, cameras: Mapping[int
 
 
 def smooth_motion(path: Mapping[int, Matrix], tolerance: float, shape: tuple[int, ...]) -> Matrix:
-    """Motion T − 1 from a frame to where it is on the smooth path.
+    """Motion T − 1 from a frame to where it is on the smooth path, given e as the tolerance.
 
     ``path`` (2, 3); returns (2, 3).
     """
-    times, seen, weights = _samples(path)
-    smooth, share, value, doubt = np.zeros(6), 1.0, None, 0.0
-    for span, order in _FITS:
-        near = np.abs(times) <= span
-        one_sided = min(np.sum(times[near] < 0), np.sum(times[near] > 0)) < 2
-        if near.sum() < _FEWEST or (order == 2 and one_sided):
-            continue
-        if one_sided and value is None:
-            # At the ends of a scene the first line is extrapolated.
-            share *= _AT_ENDS
-        curves, now = _curves(times[near], weights[near], order), int(np.sum(times[near] < 0))
-        remains = seen[near] - curves @ seen[near]
-        likely = _likelihoods(remains, weights[near], shape)
-        left = np.tensordot(likely, remains, 1)
-        before, value = value, -left[now]
-        # Lines that meet also fit a camera that shakes.
-        share *= 1 / (1 + (_size(remains[0], weights[near], shape) / max(tolerance, _LEAST)) ** 8)
-        if before is not None:
-            differs = camera_size((value - before).reshape(2, 3), shape)
-            share *= 1 / (1 + (differs / max((_DOUBT if order else _RESTING) * doubt, _LEAST)) ** 4)
-        smooth = smooth + share * (value - smooth)
-        within = np.sqrt(likely @ np.square(curves[:, now]).sum(axis=1)) * _size(left, weights[near], shape)
-        between = _size(left[now] - remains[:, now], likely, shape)
-        doubt = float(np.hypot(within * _alikeness(times[near], left), between))
-    return smooth.reshape(2, 3)
+    times = tuple(sorted(time for time in {*path, 0} if abs(time) <= _NEAR or time % _EVERY == 0))
+    if len(times) < _FEWEST:
+        return np.zeros((2, 3))
+    seen = np.stack([path[time] if time else np.zeros((2, 3)) for time in times])
+    sizes = np.array([camera_size(np.outer([1, 0], unit), shape) for unit in np.eye(3)])
+    seen = (seen * sizes).reshape(-1, 6)
+    models = _models(times)
+    squares = np.einsum("tc,mtu,uc->mc", seen, models.left, seen)
+    squares += _ERROR**2 * np.trace(models.left, axis1=1, axis2=2)[:, None]
+    variance = squares / (len(times) - 1)
+    share = 1 / (1 + (variance / max(tolerance, _LEAST) ** 2) ** 4)
+    evidence = models.evidence[:, None] - (len(times) - 1) / 2 * np.log(variance) + np.log(share)
+    evidence = evidence.reshape(len(_TIMES), -1, seen.shape[1])
+    # Turbulence has one correlation time, of which the other coefficients on average tell as much as this one.
+    of_time = np.logaddexp.reduce(evidence, axis=1)
+    others = (of_time.sum(1, keepdims=True) - of_time) / (seen.shape[1] - 1)
+    likely = np.exp(evidence + others[:, None] - np.max(of_time + others, axis=0)).reshape(variance.shape)
+    smooth = np.einsum("mc,mc->c", likely / likely.sum(0) * share, models.here @ seen)
+    return np.asarray(smooth.reshape(2, 3) / sizes, np.float64)
 
 
 def without_shake(path: Mapping[int, Matrix], order: int) -> Matrix:
@@ -113,9 +107,10 @@ def without_shake(path: Mapping[int, Matrix], order: int) -> Matrix:
 
     ``path`` (2, 3); returns (2, 3).
     """
-    times, seen, _ = _samples(path)
+    times = np.array(sorted({*path, 0}))
+    seen = np.stack([path[time] if time else np.zeros((2, 3)) for time in times.tolist()]).reshape(-1, 6)
     # With one neighbour a line fits both: the frame stays.
-    return (_curves(times, np.ones(len(times)), order)[0] @ seen)[times == 0].reshape(2, 3)
+    return np.polynomial.polynomial.polyfit(times, seen, order)[0].reshape(2, 3)
 
 
 def homogeneous(matrix: Matrix) -> Matrix:
@@ -134,41 +129,36 @@ def motion(pose: Matrix) -> Matrix:
     return pose[:2] - np.eye(3)[:2]
 
 
-def _samples(path: Mapping[int, Matrix]) -> tuple[Matrix, Matrix, Matrix]:
-    """Arrange a path: times, motions as rows, and the number of frames that each counts for, as some are skipped."""
-    times = np.array(sorted([*path, 0]), np.float64)
-    seen = np.stack([path[int(time)] if time else np.zeros((2, 3)) for time in times]).reshape(-1, 6)
-    return times, seen, np.gradient(times) if len(times) > 1 else np.ones(1)
+@dataclass(frozen=True, eq=False)
+class _Models:
+    """Models of a path at given times."""
+
+    evidence: Matrix  # (M,): logarithm of the probability a priori, and of what the evidence does not have of y
+    left: Matrix  # (M, n, n): Q
+    here: Matrix  # (M, n): weights of y in the mean of c_k
 
 
-def _alikeness(times: Matrix, left: Matrix) -> float:
-    """By how much more the mean of residuals varies than that of independent ones: √((1 + ρ) / (1 − ρ))."""
-    gaps = np.diff(times)
-    near, shifts = gaps <= _SUCCESSIVE, left.reshape(-1, 2, 3)[..., 2]
-    earlier, later = shifts[:-1][near], shifts[1:][near]
-    alike = 2 * (earlier * later).sum() / max((earlier**2 + later**2).sum(), _LEAST**2)
-    correlation = float(np.clip(alike, 0, _MOST_ALIKE)) ** (1 / gaps[near].mean())
-    return float(np.sqrt((1 + correlation) / (1 - correlation)))
-
-
-def _curves(times: Matrix, weights: Matrix, order: int) -> Matrix:
-    """Projections of samples on a polynomial and, beside a parabola, on pairs of lines that meet at a frame."""
-    line, root = times / LONGEST, np.sqrt(weights)
-    bases = [line[:, None] ** np.arange(order + 1)]
-    if order == 2:
-        bases += [np.stack([line**0, line, np.abs(line - bend)], 1) for bend in line[2:-2]]
-    basis = np.stack(bases)
-    return np.asarray(basis @ (np.linalg.pinv(basis * root[:, None]) * root), np.float64)
-
-
-def _likelihoods(left: Matrix, weights: Matrix, shape: tuple[int, ...]) -> Matrix:
-    """Probability of a polynomial and of pairs of lines from what each leaves, their scatter not being known."""
-    sizes = np.array([max(_size(one, weights, shape), _LEAST) for one in left])
-    likely = (sizes.min() / sizes) ** (2 * (len(weights) - 3))
-    likely[1:] /= max(len(left) - 1, 1)
-    return np.asarray(likely / likely.sum(), np.float64)
-
-
-def _size(left: Matrix, weights: Matrix, shape: tuple[int, ...]) -> float:
-    """Root mean square of what a fit leaves, or of how far curves differ, pixels."""
-    return camera_size(np.sqrt(np.average(left**2, axis=0, weights=weights)).reshape(2, 3), shape)
+@functools.lru_cache(maxsize=8)
+def _models(times: tuple[int, ...]) -> _Models:
+    time = np.array(times, np.float64)
+    apart, ahead = np.abs(time[:, None] - time), np.abs(time)
+    sooner, later = np.minimum(ahead[:, None], ahead), np.maximum(ahead[:, None], ahead)
+    walk = np.where(np.sign(time[:, None]) == np.sign(time), sooner**2 * (3 * later - sooner) / 6, 0.0)
+    line = _VELOCITY**2 * np.outer(time, time)
+    air = np.stack([np.exp(-apart / correlated) for correlated in _TIMES])
+    smooth = np.stack([0 * line, line, *(line + diffusion * walk for diffusion in _WALKS)])
+    total = air[:, None] + smooth
+    inverse, logarithm = np.linalg.inv(total), np.linalg.slogdet(total)[1]
+    # A turn adds a product of vectors to the covariance of the line (Sherman and Morrison 1950).
+    turns = np.stack([np.clip((time - bend) * (1 if bend >= 0 else -1), 0, None) for bend in _TURNS])
+    along = np.einsum("atu,bu->abt", inverse[:, 1], _VELOCITY * turns)
+    growth = 1 + np.einsum("abt,bt->ab", along, _VELOCITY * turns)
+    turned = inverse[:, 1, None] - along[..., None] * along[:, :, None] / growth[..., None, None]
+    inverse = np.concatenate([inverse, turned], 1).reshape(-1, *line.shape)
+    logarithm = np.concatenate([logarithm, logarithm[:, 1, None] + np.log(growth)], 1).ravel()
+    # Resting, constant velocity, all walks and all turns are as probable a priori.
+    counts = [1, 1, *[len(_WALKS)] * len(_WALKS), *[len(_TURNS)] * len(_TURNS)]
+    ones = inverse.sum(2)
+    left = inverse - ones[:, :, None] * ones[:, None] / ones.sum(1)[:, None, None]
+    evidence = -np.tile(np.log(counts), len(_TIMES)) - (logarithm + np.log(ones.sum(1))) / 2
+    return _Models(evidence, left, ones / ones.sum(1)[:, None])

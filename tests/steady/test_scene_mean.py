@@ -1,0 +1,95 @@
+"""The mean of the frames around a frame: where the camera was, and the scene without turbulence."""
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+from shaken_scenes import photo, psnr
+
+from turbrestore.steady.camera_path.camera import fit_camera
+from turbrestore.steady.camera_path.path import LONGEST
+from turbrestore.steady.dewarping import measure_flow
+from turbrestore.steady.scene_mean import iter_scene_means
+from turbrestore.steady.settings import SteadyParams
+from turbrestore.steady.video import steady_frames
+from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
+
+SIZE = 96
+
+
+def pan(count, velocity):
+    """Frames of a camera that pans, and how far it has come."""
+    wide = cv2.GaussianBlur(photo(size=3 * SIZE), (0, 0), 1.0)
+    places = velocity * np.arange(count, dtype=float)
+    return [cv2.warpAffine(wide, np.array([[1, 0, -20 - x], [0, 1, -60]]), (SIZE, SIZE)) for x in places], places
+
+
+def through_air(frames, rms, seed):
+    rng = np.random.default_rng(seed)
+    flows = smooth_flows(len(frames), SIZE, SIZE, rng, SmoothFlowParams(rms=rms, correlation_length=20.0))
+    flows -= flows.mean(axis=0)
+    return [distort(frame, flow[None], rng, noise=0.0)[0] for frame, flow in zip(frames, flows, strict=True)]
+
+
+@pytest.mark.parametrize("velocity", [0.0, 0.7])
+def test_positions_are_those_of_the_camera(velocity):
+    frames, places = pan(80, velocity)
+    found = np.array([mean.position[:2, 2] for mean in iter_scene_means(frames)])
+    # The scene moves to the left.
+    assert found[:, 0] == pytest.approx(-places, abs=0.15)
+    assert np.abs(found[:, 1]).max() < 0.15
+
+
+def test_path_and_mean_are_those_of_the_frames_around():
+    frames = pan(130, 0.4)[0]
+    means = list(iter_scene_means(frames))
+    assert len(means) == len(frames)
+    for number in (0, 60, 129):
+        path = means[number].path
+        assert set(path) == {other - number for other in range(130) if 0 < abs(other - number) <= LONGEST}
+        assert all(abs(path[j][0, 2] + 0.4 * j) < 0.2 for j in path)
+        known = means[number].share == 1
+        assert known.mean() > 0.85
+        assert psnr(means[number].image, frames[number], known) > 32
+
+
+def test_air_averages_out_of_the_mean():
+    truth, _ = pan(1, 0.0)
+    seen = through_air(truth * 60, 1.5, 0)
+    mean = list(iter_scene_means(seen))[30]
+    # The mean lies where the air has moved the whole frame, which the path tells.
+    path = np.mean([camera[:, 2] for camera in mean.path.values()], 0)
+    shift = fit_camera(measure_flow(truth[0], mean.image, np.zeros((SIZE, SIZE, 2), np.float32)))[:, 2]
+    assert np.hypot(*path) > 0.3
+    assert np.hypot(*(path + shift)) < 0.15
+
+
+def test_a_scene_has_means_of_its_own():
+    first, second = pan(1, 0.0)[0][0], photo("brick", SIZE)
+    means = list(iter_scene_means([first] * 5 + [second] * 6))
+    assert [len(mean.path) for mean in means] == [4] * 5 + [5] * 6
+    assert psnr(means[4].image, first) > 40
+    assert psnr(means[5].image, second) > 40
+
+
+def test_frames_that_can_be_read_twice_lie_nearer_to_their_place():
+    truth, _ = pan(1, 0.0)
+    seen = through_air(truth * 60, 1.5, 1)
+    errors = [
+        np.mean([np.square(frame.image - truth[0]).mean() for frame in steady_frames(given, SteadyParams(sigma=0))])
+        for given in (seen, iter(seen))
+    ]
+    assert errors[0] < 0.7 * errors[1]
+
+
+def test_no_more_frames_are_read_than_the_windows_need():
+    read, frames = itertools.count(), pan(1, 0.0)[0] * 200
+
+    def counted():
+        for frame in frames:
+            next(read)
+            yield frame
+
+    next(iter_scene_means(counted()))
+    assert next(read) <= LONGEST + 13
