@@ -38,6 +38,7 @@ from .displacement import (
     displacement_sizes,
     expected_motion,
     largest_displacement,
+    likely_turbulence,
     mean_displacement,
     moving_mask,
     path_length,
@@ -69,6 +70,7 @@ class DewarpedFrame:
     largest: float  # what turbulence displaces at most, pixels; infinite without neighbours
     size: float  # median size of the displacement of turbulence, pixels
     steadiness: float  # whether the camera moves at constant velocity, 0 to 1
+    turbulence: float  # whether displacements may be those of turbulence, 0 to 1
     starts_scene: bool  # whether a new scene starts here
     # (2, 3): affine motion of the camera from the frame to each neighbour, by its distance in frames, pixels about the
     # centre of the image.
@@ -86,7 +88,7 @@ def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
     flows, cameras = _measure(window)
     own = without_camera(flows, cameras, shape)
     removed_camera, displacement, largest = np.zeros((2, 3)), np.zeros((*grid, 2), np.float32), np.inf
-    size, steadiness, path = 0.0, 1.0, np.zeros(grid, np.float32)
+    size, steadiness, turbulence, path = 0.0, 1.0, 1.0, np.zeros(grid, np.float32)
     if flows:
         sizes = displacement_sizes(own)
         size = float(np.mean(sizes))
@@ -94,8 +96,9 @@ def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
         whole = whole_displacement(sizes[0]) if {-1, 1} <= flows.keys() else 0.0
         steadiness = camera_steadiness({} if params.camera == "lock" else cameras, shape, whole)
         largest = params.largest or largest_displacement(size, steadiness)
+        turbulence = likely_turbulence(sizes)
         removed_camera = (
-            smooth_motion(cameras, whole_displacement(size, largest), shape)
+            turbulence * smooth_motion(cameras, whole_displacement(size, largest), shape)
             if params.camera == "keep"
             else without_shake(cameras, order=int(params.camera == "steady"))
         )
@@ -126,6 +129,7 @@ def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
         largest=largest,
         size=size,
         steadiness=steadiness,
+        turbulence=turbulence,
         starts_scene=window.starts_scene,
         cameras=cameras,
         removed_camera=removed_camera,

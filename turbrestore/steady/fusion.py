@@ -96,8 +96,12 @@ def agreement_weight(neighbour: FloatArray, frame: FloatArray, tolerance: FloatA
 
     ``neighbour, frame`` (H, W) or (H, W, 3); ``tolerance`` (h, w); returns (h, w).
     """
-    pixel = pixel_of(frame.shape)
-    difference = cv2.GaussianBlur(reduced(neighbour - frame), (0, 0), _DIFFERENCE_WINDOW / pixel)
+    return agreement_on_grid(reduced(neighbour - frame), tolerance, pixel_of(frame.shape))
+
+
+def agreement_on_grid(difference: FloatArray, tolerance: FloatArray, pixel: float) -> FloatArray:
+    """Weight (h, w) of an image from its difference (h, w[, 3]) on a grid whose pixel is so many of the image wide."""
+    difference = cv2.GaussianBlur(difference, (0, 0), _DIFFERENCE_WINDOW / pixel)
     np.square(difference, out=difference)
     square = cv2.GaussianBlur(_mean_of_channels(difference), (0, 0), _SQUARE_WINDOW / pixel)
     return np.asarray(np.exp(square / (-2 * tolerance)), np.float32)

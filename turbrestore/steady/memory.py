@@ -56,8 +56,9 @@ from ..core.arrays import FloatArray, luminance
 from ..registration.warp import inside, sample_linear, warp
 from .camera_path.camera import Matrix, camera_flow, fit_camera
 from .camera_path.path import motion
-from .fusion import agreement_weight, explained_difference, for_channels
+from .fusion import agreement_on_grid, agreement_weight, explained_difference, for_channels
 from .grid import enlarged, follow, grid_of, inverted, pixel_of, reduced
+from .scene_mean import SceneMean
 from .windows import coarse_image, light_between, relit
 
 # Flow between two images (h, w, 2): reference, image, where the search starts, shape of the frames.
@@ -77,6 +78,8 @@ _LEAST_WEIGHT = 0.05
 _WEAK, _STRONG = 1.2, 1.8
 # Least g_A, chosen: an offset from the path of the camera falls to 1/e within 12 frames.
 _PULL = 1 / 12
+# Every how many frames a memory that is no longer young is placed in the mean of the frames around.
+_PLACED = 4
 # Windows of the distance from B, pixels; weight of a frame in its mean over time, frames in B, and a distance that does
 # not count, squared intensity.
 _DIFFERENCE_WINDOW, _DISTANCE_WINDOW = 1.0, 6.0
@@ -93,7 +96,7 @@ class Memory:
 
     image: FloatArray  # (H, W) or (H, W, 3): Z, at the mean geometry of the frames
     held: FloatArray  # (H, W): n, frames
-    frames: int  # number of frames since the memory began, at most the longest memory
+    frames: int  # number of frames since the memory began
     pose: Matrix  # (3, 3): E
     mean: FloatArray  # (H, W): B
     distances: FloatArray  # (H, W, 2): e_Z and e_F, squared intensity
@@ -104,10 +107,10 @@ class Memory:
 class Around:
     """Mean of the frames before and after a frame, in which it is placed."""
 
-    image: FloatArray  # (h, w): M, luminance on the grid, at the position of the frame
-    share: FloatArray  # (h, w): how far M is known, 0 to 1
+    mean: SceneMean
     back: Matrix  # (3, 3): from the steadied frame to the frame
     largest: float  # what turbulence displaces at most, pixels, however the camera moves
+    trust: float  # whether displacements are those of turbulence, 0 to 1
 
 
 def remember(
@@ -148,15 +151,18 @@ def remember(
     near, beside = _beside(moving)
     weight *= reduced((1 - cv2.GaussianBlur(near, (0, 0), _MARGIN_EDGE)) * agrees)
     own = _filled(own, np.where(beside, 0, weight), pixel)
-    frames = min(memory.frames + 1, _LONGEST)
-    kept = steadiness * (1 - 1 / frames)
+    frames = memory.frames + 1
+    kept = steadiness * (1 - 1 / min(frames, _LONGEST))
     held = 1 + enlarged(weight, shape) * np.minimum(memory.held, kept / (1 - kept))
     innovation = warp(image, enlarged(own, shape) + camera_flow(camera, shape)) - memory.image
     innovation /= for_channels(held, image)
     if around is None:
         drift = camera_flow(max(1 - kept, _PULL) * (camera - expected), shape, grid) + np.float32(1 - kept) * own
+    elif frames % _PLACED == 0 or _PLACED * (1 - kept) > 1:
+        pull = np.float32(min(_PLACED * (1 - kept), 1))
+        drift = pull * _off_mean(memory.image, memory.pose, around, flow_between, beside, tolerance)
     else:
-        drift = np.float32(1 - kept) * _off_mean(memory.image, memory.pose, around, flow_between, beside, tolerance)
+        drift = np.zeros_like(own)
     inverse = enlarged(inverted(drift, shape), shape)
     mean = memory.mean + (placed - memory.mean) / np.float32(min(frames, _RECENT))
     replaced = float(1 - agrees.mean())
@@ -195,14 +201,15 @@ def _off_mean(
     """Flow from an image at a pose to the mean of the frames around, filled in where it cannot be trusted."""
     shape = image.shape[:2]
     grid, pixel = grid_of(shape), pixel_of(shape)
-    to_frame = motion(around.back @ np.linalg.inv(pose))
-    there, seen = camera_flow(to_frame, shape, grid), reduced(luminance(image))
-    mean, share = follow(around.image, there, shape), follow(around.share, there, shape)
+    mean, known = around.mean.seen_from(around.back @ np.linalg.inv(pose))
+    known *= around.trust
+    seen = reduced(luminance(image))
     mean = relit(mean, light_between(coarse_image(mean), coarse_image(seen)))
-    mean = seen + share * (mean - seen)
+    mean = seen + known * (mean - seen)
     flow = flow_between(image, mean, np.zeros((*grid, 2), np.float32), shape)
-    weight = agreement_weight(follow(mean, flow, shape), seen, tolerance) * _turbulent(flow, around.largest, pixel)
-    return _filled(flow, np.where(beside, 0, weight * share), pixel)
+    weight = agreement_on_grid(follow(mean, flow, shape) - seen, tolerance, pixel)
+    weight *= _turbulent(flow, around.largest, pixel) * known
+    return _filled(flow, np.where(beside, 0, weight), pixel)
 
 
 def _strength(largest: float) -> float:

@@ -9,8 +9,9 @@ C_c, n_c : sum of the frames of a run of successive frames at the position G_c o
     them show a pixel
 M : mean at the position of frame k, ``Σ C_c ∘ (G_c G_k⁻¹) / Σ n_c ∘ (G_c G_k⁻¹)``
 
-G_j is the affine part of the flow from B to frame j.  B averages turbulence and objects that move, and errors do not
-add up from frame to frame.  Luminance on the grid of the frames is enough, since only flow is measured from it.
+G_j is the affine part of the flow from B to frame j, where B has texture: flow is arbitrary elsewhere.  B averages
+turbulence and objects that move, and errors do not add up from frame to frame.  Luminance on the grid of the frames is
+enough, since only flow is measured from it.
 
 The frames are read once more for this, ahead of those that are steadied.  Memory holds the runs around a frame.
 """
@@ -22,20 +23,26 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import groupby
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, luminance
+from ..core.gradient import sobel_gradient
 from ..registration.camera.global_shift import ShiftReference, prepare_shift_reference
-from ..registration.warp import inside
 from .camera_path.camera import Matrix, camera_flow, fit_camera
 from .camera_path.path import LONGEST, homogeneous, motion
 from .dewarping import first_guess, measure_flow
-from .grid import follow, grid_of, pixel_of, reduced
+from .grid import grid_of, pixel_of, reduced
 from .windows import iter_scenes
 
 # Frames of a run, and frames that the running mean remembers.
 _RUN, _REMEMBERED = 12, LONGEST
+# Windows of the gradient and of its square, pixels of the grid; gradient, intensity a pixel, at which a place counts
+# half, and the weight of a flat one.  Half or twice the gradient does as well, four times leaves out too much.
+_GRADIENT_WINDOW, _TEXTURE_WINDOW, _FLAT, _LEAST_WEIGHT = 0.75, 3.0, 0.004, 1e-9
+# Least count of frames that is divided by.
+_LEAST_COUNT = 1e-3
 # Share of the shorter side by which the camera moves before the running mean follows it.
 _FOLLOWED = 1 / 16
 
@@ -46,8 +53,19 @@ class SceneMean:
 
     position: Matrix  # (3, 3): G_k
     path: Mapping[int, Matrix]  # (2, 3): motion of the camera to the frames around it, by their distance in frames
-    image: FloatArray  # (h, w): M, luminance on the grid, at the position of the frame
-    share: FloatArray  # (h, w): how far it is known, 0 where no frame around shows it and 1 where a run of them does
+    runs: tuple[_Run, ...]
+    shape: tuple[int, ...]  # of the frame
+
+    def seen_from(self, pose: Matrix) -> tuple[FloatArray, FloatArray]:
+        """Luminance (h, w) where a map (3, 3) leads from there to the frame, and how far it is known, 0 to 1.
+
+        A run of frames that show a place make it known.
+        """
+        back = np.linalg.inv(self.position) @ pose
+        total, count = cv2.split(
+            np.add.reduce([_moved(one.sums, one.position @ back, self.shape) for one in self.runs])
+        )
+        return total / np.maximum(count, _LEAST_COUNT), np.minimum(count / _RUN, 1)
 
 
 def iter_scene_means(frames: Iterable[ArrayLike]) -> Iterator[SceneMean]:
@@ -65,11 +83,11 @@ def _means_of_scene(images: Iterable[FloatArray]) -> Iterator[SceneMean]:
     camera, due, shape = _Camera(), 0, (0, 0)
     for number, image in enumerate(images):
         shape = image.shape[:2]
-        grey = luminance(reduced(image))
-        positions[number] = camera.follow(image, grey)
+        seen = cv2.merge([luminance(reduced(image)), np.ones(grid_of(shape), np.float32)])
+        positions[number] = camera.follow(image, seen)
         if number % _RUN == 0:
-            runs.append(_Run(number, positions[number], np.zeros_like(grey), np.zeros_like(grey)))
-        runs[-1].add(grey, positions[number], shape)
+            runs.append(_Run(number, positions[number], np.zeros_like(seen)))
+        runs[-1].add(seen, positions[number], shape)
         if (number + 1) % _RUN:
             continue
         while due + LONGEST <= number:
@@ -88,72 +106,72 @@ class _Run:
 
     start: int  # number of its first frame
     position: Matrix  # (3, 3): G_c
-    total: FloatArray  # (h, w): C_c
-    count: FloatArray  # (h, w): n_c
+    sums: FloatArray  # (h, w, 2): C_c and n_c
 
-    def add(self, grey: FloatArray, position: Matrix, shape: tuple[int, ...]) -> None:
-        """Add a frame on its grid."""
-        placed, seen = _moved(grey, position @ np.linalg.inv(self.position), shape)
-        self.total[...] += seen * placed
-        self.count[...] += seen
+    def add(self, seen: FloatArray, position: Matrix, shape: tuple[int, ...]) -> None:
+        """Add a frame and a count of one (h, w, 2) on its grid."""
+        self.sums[...] += _moved(seen, position @ np.linalg.inv(self.position), shape)
 
 
 class _Camera:
     """Follows the camera through a scene by what frames lie away from their running mean."""
 
     def __init__(self) -> None:
-        self._mean = self._count = np.zeros((0, 0), np.float32)
-        # G of the mean, the map from the mean to the last frame, and that frame.
+        # Sum and count of the frames (h, w, 2).
+        self._sums = np.zeros((0, 0, 2), np.float32)
+        # G of the sum, the map from the sum to the last frame, and that frame.
         self._start = self._pose = np.eye(3)
         self._last: ShiftReference | None = None
 
-    def follow(self, image: FloatArray, grey: FloatArray) -> Matrix:
-        """Return the position of the next frame, whose luminance on the grid is given as well."""
+    def follow(self, image: FloatArray, seen: FloatArray) -> Matrix:
+        """Return the position of the next frame, whose luminance and a count of one (h, w, 2) are given as well."""
         shape, prepared = image.shape[:2], prepare_shift_reference(image)
         if self._last is None:
-            self._mean, self._count = grey.copy(), np.ones_like(grey)
+            self._sums = seen.copy()
         else:
-            start = motion(homogeneous(first_guess(self._last, prepared, image)) @ self._pose)
-            flow = measure_flow(self._mean, grey, camera_flow(start, shape, grey.shape), shape)
-            self._pose = homogeneous(fit_camera(flow, shape))
-            placed, seen = _moved(grey, self._pose, shape)
-            self._count = np.minimum(self._count + seen, _REMEMBERED)
-            self._mean += seen * (placed - self._mean) / self._count
+            expected = homogeneous(first_guess(self._last, prepared, image)) @ self._pose
+            mean = self._sums[..., 0] / self._sums[..., 1]
+            flow = measure_flow(mean, seen[..., 0], camera_flow(motion(expected), shape, mean.shape), shape)
+            self._pose = homogeneous(fit_camera(flow, shape, _texture(mean)))
+            self._sums += _moved(seen, self._pose, shape)
+            self._sums *= np.minimum(_REMEMBERED / self._sums[..., 1:], 1)
         self._last = prepared
         position = self._pose @ self._start
         if np.abs(motion(self._pose) @ [shape[1] / 2, shape[0] / 2, 1.0]).max() > _FOLLOWED * min(shape):
-            self._move_to(grey, shape)
+            self._move_to(seen, shape)
         return position
 
-    def _move_to(self, grey: FloatArray, shape: tuple[int, ...]) -> None:
-        """Bring the mean to the position of the last frame, which fills what comes into sight."""
-        back = np.asarray(np.linalg.inv(self._pose), np.float64)
-        placed, seen = _moved(self._mean, back, shape)
-        count = _moved(self._count, back, shape)[0]
-        self._mean, self._count = grey + seen * (placed - grey), 1 + seen * (count - 1)
+    def _move_to(self, seen: FloatArray, shape: tuple[int, ...]) -> None:
+        """Bring the sum to the position of the last frame, which fills what comes into sight."""
+        moved = _moved(self._sums, np.asarray(np.linalg.inv(self._pose), np.float64), shape)
+        self._sums = np.where(moved[..., 1:] < 1, seen, moved)
         self._start, self._pose = self._pose @ self._start, np.eye(3)
 
 
 def _mean_around(
     number: int, positions: Mapping[int, Matrix], runs: Iterable[_Run], shape: tuple[int, ...]
 ) -> SceneMean:
-    back = np.asarray(np.linalg.inv(positions[number]), np.float64)
-    sums = []
-    for run in runs:
-        total, seen = _moved(run.total, run.position @ back, shape)
-        count, _ = _moved(run.count, run.position @ back, shape)
-        sums.append(seen * np.stack([total, count]))
-    total, count = np.add.reduce(sums)
+    back = np.linalg.inv(positions[number])
     path = {
         other - number: motion(position @ back)
         for other, position in positions.items()
         if 0 < abs(other - number) <= LONGEST
     }
-    share = np.minimum(count / _RUN, 1)
-    return SceneMean(positions[number], path, np.asarray(total / np.maximum(count, 1), np.float32), share)
+    return SceneMean(positions[number], path, tuple(runs), shape)
 
 
-def _moved(field: FloatArray, pose: Matrix, shape: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
-    """Field on the grid where a map leads, and where it lies inside."""
-    flow = camera_flow(motion(pose), shape, grid_of(shape))
-    return follow(field, flow, shape), inside(flow / np.float32(pixel_of(shape)))
+def _texture(grey: FloatArray) -> FloatArray:
+    """Weight (h, w) of the flow of an image, which is arbitrary where the image is flat."""
+    along_x, along_y = sobel_gradient(cv2.GaussianBlur(grey, (0, 0), _GRADIENT_WINDOW))
+    square = cv2.GaussianBlur(along_x**2 + along_y**2, (0, 0), _TEXTURE_WINDOW)
+    # A flat image has no more weight in one place than in another.
+    return np.asarray((square + _LEAST_WEIGHT) / (square + _FLAT**2), np.float32)
+
+
+def _moved(sums: FloatArray, pose: Matrix, shape: tuple[int, ...]) -> FloatArray:
+    """Sum and count (h, w, 2) on the grid where a map leads, zero outside."""
+    grid = sums.shape[:2]
+    height, width = (np.arange(length, dtype=np.float32) for length in grid)
+    to = camera_flow(motion(pose), shape, grid) / np.float32(pixel_of(shape))
+    x, y = width + to[..., 0], height[:, None] + to[..., 1]
+    return cv2.remap(sums, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)

@@ -290,7 +290,7 @@ class _Scenes:
         else:
             tolerance = whole_displacement(frame.size, frame.largest)
             path = longer_path(self._positions, position, frame.cameras) if mean is None else mean.path
-            steadied = homogeneous(smooth_motion(path, tolerance, shape))
+            steadied = homogeneous(frame.turbulence * smooth_motion(path, tolerance, shape))
         back, carry = np.linalg.inv(steadied), np.eye(3)
         if self._positions:
             carry = self._steadied @ self._positions[-1] @ np.linalg.inv(position) @ back
@@ -299,7 +299,7 @@ class _Scenes:
         if mean is None:
             return carry, dewarped @ back, None
         largest = self._params.largest or largest_displacement(frame.size, 1.0)
-        return carry, dewarped @ back, Around(mean.image, mean.share, back, largest)
+        return carry, dewarped @ back, Around(mean, back, largest, frame.turbulence)
 
     def _remembered_width(self, memory: Memory) -> float:
         """Width to remove from what is remembered, which gradually becomes the one that its own image needs."""

@@ -25,11 +25,11 @@ _STEP, _FITS = 8, 4
 _LEAST_DISTANCE = 1e-3
 
 
-def fit_camera(flow: FloatArray, shape: tuple[int, ...] | None = None) -> Matrix:
+def fit_camera(flow: FloatArray, shape: tuple[int, ...] | None = None, weight: FloatArray | None = None) -> Matrix:
     """Fit an affine flow that outliers hardly influence.
 
-    ``flow`` (H, W, 2), or (h, w, 2) on a grid over an image of this shape (:mod:`turbrestore.steady.grid`); returns
-    (2, 3).
+    ``flow`` (H, W, 2), or (h, w, 2) on a grid over an image of this shape (:mod:`turbrestore.steady.grid`); ``weight``
+    (H, W) or (h, w); returns (2, 3).
     """
     height, width = flow.shape[:2]
     shape = shape or flow.shape
@@ -38,12 +38,13 @@ def fit_camera(flow: FloatArray, shape: tuple[int, ...] | None = None) -> Matrix
     samples = flow[every, every].reshape(-1, 2).astype(np.float64)
     x, y = np.meshgrid(*(places[every] for places in _places(flow.shape, shape)))
     basis = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], 1)
-    weighted = basis
+    trusted = basis if weight is None else basis * weight[every, every].reshape(-1, 1)
+    weighted = trusted
     for _ in range(_FITS):
         solution = np.linalg.solve(weighted.T @ basis, weighted.T @ samples)
         distance = np.linalg.norm(samples - basis @ solution, axis=1)
         scale = 2 * max(float(np.median(distance)), _LEAST_DISTANCE)
-        weighted = basis / (1 + (distance[:, None] / scale) ** 2)
+        weighted = trusted / (1 + (distance[:, None] / scale) ** 2)
     return np.asarray(solution.T, np.float64)
 
 
