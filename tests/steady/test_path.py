@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from turbrestore.steady.camera_path.path import LONGEST, _models, smooth_motion
-from turbrestore.steady.displacement import camera_steadiness, displacement_sizes, whole_displacement
+from turbrestore.steady.displacement import camera_steadiness, displacement_sizes, likely_turbulence, whole_displacement
+from turbrestore.steady.settings import SteadyParams
 
 SHAPE = (120, 160)
 
@@ -112,3 +113,25 @@ def test_a_camera_at_rest_loses_little_by_turns_that_are_possible():
     ends = np.concatenate([steadied(0.3 * one) for one in wanders])
     of_mean = 0.3 * np.sqrt((1 + 0.8) / (1 - 0.8) / (LONGEST + 13))
     assert np.sqrt(np.square(ends).mean()) < 1.3 * of_mean
+
+
+@pytest.mark.parametrize("reach", [12, 20, 50, 58])
+def test_all_neighbours_of_a_window_count(reach):
+    # A static camera, whose frames turbulence moves: the mean over few frames.
+    rng, ends = np.random.default_rng(5), []
+    distances = SteadyParams(reach=reach).distances
+    for _ in range(200):
+        path = {offset: np.zeros((2, 3)) for one in distances for offset in (one, -one)}
+        here = rng.standard_normal(2)
+        for camera in path.values():
+            camera[:, 2] = rng.standard_normal(2) - here
+        ends.append(here + smooth_motion(path, 4.0, SHAPE)[:, 2])
+    assert np.sqrt(np.square(ends).mean()) < 0.7
+
+
+def test_displacements_that_grow_with_the_distance_in_time_are_no_turbulence():
+    times = np.array([1, 3, 6, 9, 12])
+    for correlated in (1.0, 9.0):
+        alike, twice = np.exp(-times / correlated), np.exp(-2 * times / correlated)
+        assert likely_turbulence(np.sqrt(1.5 + twice / 2 - 2 * alike).tolist()) > 0.95
+    assert likely_turbulence((0.06 * times**1.5).tolist()) < 0.01

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from shaken_scenes import photo, psnr
 
+from turbrestore.core.errors import DataError
 from turbrestore.steady.camera_path.camera import fit_camera
 from turbrestore.steady.camera_path.path import LONGEST
 from turbrestore.steady.dewarping import measure_flow
@@ -97,6 +98,59 @@ def test_colour_on_a_coarser_grid_is_placed_as_well():
     steadied = [frame.image for frame in steady_frames(seen, SteadyParams(sigma=0))]
     before, after = (np.mean([np.square(one - truth).mean() for one in images]) for images in (seen, steadied))
     assert after < 0.2 * before
+
+
+class Once:
+    """Frames of a device that gives each of them once."""
+
+    def __init__(self, frames):
+        self._frames = iter(frames)
+
+    def __iter__(self):
+        return self._frames
+
+
+def test_frames_that_can_be_read_once_are_all_there():
+    frames = pan(1, 0.0)[0] * 30
+    assert len(list(steady_frames(Once(frames), SteadyParams(sigma=0, reach=4)))) == 30
+
+
+def test_fewer_frames_the_second_time_are_refused():
+    class Shorter:
+        def __init__(self):
+            self._count = 90
+
+        def __iter__(self):
+            self._count -= 15
+            return iter(pan(1, 0.0)[0] * self._count)
+
+    with pytest.raises(DataError, match="expected the same frames every time they are read, found only"):
+        list(steady_frames(Shorter(), SteadyParams(sigma=0, reach=4)))
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (SIZE, SIZE)])
+def test_a_zoom_about_a_corner_is_followed(corner):
+    scene = cv2.GaussianBlur(photo(size=2 * SIZE), (0, 0), 1.0)
+    frames, zooms = [], 1.01 ** np.arange(40)
+    for zoom in zooms:
+        # A pixel x of a frame shows c + (x - c) zoom, from the middle of the scene.
+        frames.append(
+            cv2.warpAffine(
+                scene,
+                np.array([[zoom, 0, (1 - zoom) * corner[0] + 48], [0, zoom, (1 - zoom) * corner[1] + 48]]),
+                (SIZE, SIZE),
+                flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+            )
+        )
+    means = list(iter_scene_means(frames))
+    assert 1 / np.linalg.det(means[-1].position) ** 0.5 == pytest.approx(zooms[-1], rel=0.01)
+
+
+def test_only_runs_around_a_frame_are_kept():
+    starts = [[run.start for run in mean.runs] for mean in iter_scene_means(pan(1, 0.0)[0] * 130)]
+    for number in (0, 60, 129):
+        assert min(starts[number]) > number - LONGEST - 12
+        assert max(starts[number]) <= number + LONGEST + 12
 
 
 def test_no_more_frames_are_read_than_the_windows_need():

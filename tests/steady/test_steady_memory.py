@@ -11,7 +11,8 @@ from turbrestore.blur.posterior import BlurWitnesses
 from turbrestore.core.noise_spectrum import white_noise
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.steady.dewarping import measure_flow
-from turbrestore.steady.memory import Memory, remember
+from turbrestore.steady.memory import Around, Memory, remember
+from turbrestore.steady.scene_mean import iter_scene_means
 from turbrestore.steady.settings import SteadyParams
 from turbrestore.steady.video import WindowWitnesses, _find_blur, _Scenes
 
@@ -45,6 +46,21 @@ class TestMemory:
             memory = remember(memory, later, measure_flow, 0.0, 2.0, 1.0, np.zeros(first.shape, bool), STILL, STILL)
         shift = np.median(measure_flow(first, memory.image, np.zeros((64, 64, 2), np.float32))[8:-8, 8:-8, 0])
         assert abs(shift - 5 / 6) < 0.1
+
+    @pytest.mark.parametrize("trust", [0.0, 1.0])
+    def test_geometry_is_that_of_the_frames_around_as_far_as_they_are_trusted(self, trust):
+        scene = cv2.GaussianBlur(photo(size=72), (0, 0), 2.0)
+        first, later = scene[:, 4:68], scene[:, 3:67]
+        still = np.zeros(first.shape, bool)
+        # The mean of the frames around is darker, and lies another pixel to the right.
+        mean = next(iter_scene_means([0.9 * scene[:, 2:66]] * 12))
+        memory, around = None, Around(mean, STILL, 2.0, trust)
+        for frame in [first] + [later] * 40:
+            memory = remember(memory, frame, measure_flow, 0.0, 2.0, 1.0, still, STILL, STILL, around)
+        shift = np.median(measure_flow(first, memory.image, np.zeros((72, 64, 2), np.float32))[8:-8, 8:-8, 0])
+        # The mean of the last frames without any flow, which the memory is checked against, lies one pixel to the right.
+        assert shift > 1.5 if trust else shift == pytest.approx(1, abs=0.1)
+        assert memory.replaced < 0.1
 
     def test_what_has_changed_passes_at_once(self):
         scene = photo(size=64)

@@ -96,7 +96,8 @@ def dewarp_frame(window: Window, params: SteadyParams) -> DewarpedFrame:
         whole = whole_displacement(sizes[0]) if {-1, 1} <= flows.keys() else 0.0
         steadiness = camera_steadiness({} if params.camera == "lock" else cameras, shape, whole)
         largest = params.largest or largest_displacement(size, steadiness)
-        turbulence = likely_turbulence(sizes)
+        # What lies at different distances drifts apart only if the camera does not move evenly.
+        turbulence = 1 - (1 - steadiness) * (1 - likely_turbulence(sizes))
         removed_camera = (
             turbulence * smooth_motion(cameras, whole_displacement(size, largest), shape)
             if params.camera == "keep"

@@ -31,10 +31,11 @@ is an error of the path or of the memory, and the output must not drift away fro
 (w small, an object or the background it uncovers) it is filled in from around.
 
 Where the mean M of the frames before and after frame k is known (:mod:`turbrestore.steady.scene_mean`), Z goes there
-instead: V is the inverse flow of ``g_r m``, m the flow from Z to ``M ∘ S⁻¹ E⁻¹`` with S the map from frame k to the
-steadied one, filled in likewise.  M averages three times as many frames as the displacement of a frame does, and no
-error of the flow to a single frame is in it.  A frame that begins a memory, as every frame of a camera that shakes, is
-placed by the whole of m, as far as turbulence is strong.
+instead, as far as displacements are those of turbulence: V is the inverse flow of ``g_r m``, m the flow from Z to
+``M ∘ S⁻¹ E⁻¹`` with S the map from frame k to the steadied one, filled in likewise.  M averages ten times as many
+frames as the displacement of a frame does, and no error of the flow to a single frame is in it.  Once g_r is below a
+quarter, m is measured every fourth frame and counts four times.  A frame that begins a memory, as every frame of a
+camera that shakes, is placed by the whole of m, as far as turbulence is strong.
 
 A memory that has gone astray, because a period of a pattern was taken for another or the scene moves slowly, may still
 agree with every next frame.  It is therefore checked against the mean B of the luminance of the last frames, which the
@@ -54,7 +55,7 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..registration.warp import inside, sample_linear, warp
-from .camera_path.camera import Matrix, camera_flow, fit_camera
+from .camera_path.camera import Matrix, camera_flow, corner_motion, fit_camera
 from .camera_path.path import motion
 from .fusion import agreement_on_grid, agreement_weight, explained_difference, for_channels
 from .grid import enlarged, follow, grid_of, inverted, pixel_of, reduced
@@ -156,18 +157,21 @@ def remember(
     held = 1 + enlarged(weight, shape) * np.minimum(memory.held, kept / (1 - kept))
     innovation = warp(image, enlarged(own, shape) + camera_flow(camera, shape)) - memory.image
     innovation /= for_channels(held, image)
-    if around is None:
-        drift = camera_flow(max(1 - kept, _PULL) * (camera - expected), shape, grid) + np.float32(1 - kept) * own
-    elif frames % _PLACED == 0 or _PLACED * (1 - kept) > 1:
-        pull = np.float32(min(_PLACED * (1 - kept), 1))
-        drift = pull * _off_mean(memory.image, memory.pose, around, flow_between, beside, tolerance)
-    else:
-        drift = np.zeros_like(own)
-    inverse = enlarged(inverted(drift, shape), shape)
+    # Share of the way to the mean geometry of the frames, for which flow is measured every few frames.
+    to_mean = min(_PLACED * (1 - kept), 1) if frames % _PLACED == 0 or _PLACED * (1 - kept) > 1 else 0.0
+    trust = 0.0 if around is None else around.trust
+    pulled = camera_flow(max(1 - kept, _PULL) * (camera - expected), shape, grid)
+    drift = np.float32(1 - trust) * (pulled + np.float32(1 - kept) * own)
+    if around is not None and to_mean * trust > 0:
+        off = _off_mean(memory.image, memory.pose, around, flow_between, beside, tolerance)
+        drift += np.float32(to_mean * trust) * off
+    estimate = memory.image + innovation
+    if np.any(drift):
+        inverse = enlarged(inverted(drift, shape), shape)
+        estimate, held = warp(estimate, inverse), sample_linear((held,), inverse)
     mean = memory.mean + (placed - memory.mean) / np.float32(min(frames, _RECENT))
     replaced = float(1 - agrees.mean())
-    estimate = warp(memory.image + innovation, inverse)
-    return Memory(estimate, sample_linear((held,), inverse), frames, memory.pose, mean, distances, replaced)
+    return Memory(estimate, held, frames, memory.pose, mean, distances, replaced)
 
 
 def _begun(
@@ -180,7 +184,7 @@ def _begun(
 ) -> Memory:
     """Begin a memory with a frame, placed in the mean of the frames around it as far as there is turbulence."""
     shape = image.shape[:2]
-    if around is not None and (strength := _strength(around.largest)):
+    if around is not None and (strength := around.trust * _strength(around.largest)):
         to_steadied = camera_flow(motion(offset), shape)
         steadied = warp(image, to_steadied)
         tolerance, beside = explained_difference(steadied, noise), _beside(moving)[1]
@@ -202,9 +206,8 @@ def _off_mean(
     shape = image.shape[:2]
     grid, pixel = grid_of(shape), pixel_of(shape)
     mean, known = around.mean.seen_from(around.back @ np.linalg.inv(pose))
-    known *= around.trust
     seen = reduced(luminance(image))
-    mean = relit(mean, light_between(coarse_image(mean), coarse_image(seen)))
+    mean = relit(mean, light_between(coarse_image(seen), coarse_image(mean)))
     mean = seen + known * (mean - seen)
     flow = flow_between(image, mean, np.zeros((*grid, 2), np.float32), shape)
     weight = agreement_on_grid(follow(mean, flow, shape) - seen, tolerance, pixel)
@@ -238,7 +241,7 @@ def _in_light(memory: Memory, seen: FloatArray) -> Memory:
 
 def shown(memory: Memory) -> Memory:
     """Bring a memory from its grid to the steadied frame."""
-    if _corner(memory.pose, memory.held.shape) < _LEAST_MOVE:
+    if corner_motion(motion(memory.pose), memory.held.shape) < _LEAST_MOVE:
         return memory
     flow = camera_flow(motion(memory.pose), memory.held.shape)
     held = sample_linear((memory.held,), flow)
@@ -249,11 +252,11 @@ def _carried(memory: Memory, carry: Matrix, offset: Matrix, image: FloatArray) -
     """Carry a memory along with the camera, by whole pixels if that is enough; what comes into sight is that of F."""
     shape = memory.held.shape
     pose = memory.pose @ carry
-    if _corner(pose, shape) < _FARTHEST:
+    if corner_motion(motion(pose), shape) < _FARTHEST:
         return replace(memory, pose=pose)
     rest = pose.copy()
     rest[:2, 2] -= np.rint(pose[:2, 2])
-    if _corner(rest, shape) >= _FARTHEST:
+    if corner_motion(motion(rest), shape) >= _FARTHEST:
         rest = np.eye(3)
     flow = camera_flow(motion(pose @ np.linalg.inv(rest)), shape)
     seen = inside(flow)
@@ -265,11 +268,6 @@ def _carried(memory: Memory, carry: Matrix, offset: Matrix, image: FloatArray) -
     return Memory(
         moved, 1 + seen * (sample_linear((memory.held,), flow) - 1), memory.frames, rest, mean, distances, 0.0
     )
-
-
-def _corner(pose: Matrix, shape: tuple[int, ...]) -> float:
-    """How far a map moves the corners of an image at most along one axis, pixels."""
-    return float((np.abs(motion(pose)) @ [shape[1] / 2, shape[0] / 2, 1.0]).max())
 
 
 def _distance(image: FloatArray, mean: FloatArray) -> FloatArray:

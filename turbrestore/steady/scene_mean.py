@@ -2,7 +2,7 @@
 
 Symbols
 -------
-k : the frame; j a frame of the same scene, at most ``LONGEST`` frames before or after it
+k : the frame; j a frame of the same scene, about ``LONGEST`` frames before or after it, by whole runs
 B : running mean of the frames of the scene so far, at the position of one of them
 G_j : position of frame j, the affine map from the first frame of the scene to it, homogeneous, pixels about the centre
 C_c, n_c : sum of the frames of a run of successive frames at the position G_c of the first of them, and how many of
@@ -30,10 +30,10 @@ from numpy.typing import ArrayLike
 from ..core.arrays import FloatArray, luminance
 from ..core.gradient import sobel_gradient
 from ..registration.camera.global_shift import ShiftReference, prepare_shift_reference
-from .camera_path.camera import Matrix, camera_flow, fit_camera
+from .camera_path.camera import Matrix, camera_flow, corner_motion, fit_camera
 from .camera_path.path import LONGEST, homogeneous, motion
 from .dewarping import first_guess, measure_flow
-from .grid import grid_of, pixel_of, reduced
+from .grid import grid_of, reduced
 from .windows import iter_scenes
 
 # Frames of a run, and frames that the running mean remembers.
@@ -57,9 +57,9 @@ class SceneMean:
     shape: tuple[int, ...]  # of the frame
 
     def seen_from(self, pose: Matrix) -> tuple[FloatArray, FloatArray]:
-        """Luminance (h, w) where a map (3, 3) leads from there to the frame, and how far it is known, 0 to 1.
+        """Return luminance (h, w) as seen from another place, and how far it is known, 0 to 1.
 
-        A run of frames that show a place make it known.
+        ``pose`` (3, 3) maps that place to the frame.  As many frames as a run has make a pixel known.
         """
         back = np.linalg.inv(self.position) @ pose
         total, count = cv2.split(
@@ -88,14 +88,9 @@ def _means_of_scene(images: Iterable[FloatArray]) -> Iterator[SceneMean]:
         if number % _RUN == 0:
             runs.append(_Run(number, positions[number], np.zeros_like(seen)))
         runs[-1].add(seen, positions[number], shape)
-        if (number + 1) % _RUN:
-            continue
-        while due + LONGEST <= number:
+        while (number + 1) % _RUN == 0 and due + LONGEST <= number:
             yield _mean_around(due, positions, runs, shape)
-            positions.pop(due - LONGEST, None)
             due += 1
-            if runs[0].start + _RUN <= due - LONGEST:
-                runs.popleft()
     for last in range(due, max(positions, default=-1) + 1):
         yield _mean_around(last, positions, runs, shape)
 
@@ -114,7 +109,7 @@ class _Run:
 
 
 class _Camera:
-    """Follows the camera through a scene by what frames lie away from their running mean."""
+    """Follows the camera through a scene by how far frames lie away from their running mean."""
 
     def __init__(self) -> None:
         # Sum and count of the frames (h, w, 2).
@@ -137,7 +132,7 @@ class _Camera:
             self._sums *= np.minimum(_REMEMBERED / self._sums[..., 1:], 1)
         self._last = prepared
         position = self._pose @ self._start
-        if np.abs(motion(self._pose) @ [shape[1] / 2, shape[0] / 2, 1.0]).max() > _FOLLOWED * min(shape):
+        if corner_motion(motion(self._pose), shape) > _FOLLOWED * min(shape):
             self._move_to(seen, shape)
         return position
 
@@ -148,9 +143,11 @@ class _Camera:
         self._start, self._pose = self._pose @ self._start, np.eye(3)
 
 
-def _mean_around(
-    number: int, positions: Mapping[int, Matrix], runs: Iterable[_Run], shape: tuple[int, ...]
-) -> SceneMean:
+def _mean_around(number: int, positions: dict[int, Matrix], runs: deque[_Run], shape: tuple[int, ...]) -> SceneMean:
+    """Mean around the next frame; what lies too far back is dropped."""
+    positions.pop(number - LONGEST - 1, None)
+    while runs[0].start + _RUN <= number - LONGEST:
+        runs.popleft()
     back = np.linalg.inv(positions[number])
     path = {
         other - number: motion(position @ back)
@@ -171,7 +168,9 @@ def _texture(grey: FloatArray) -> FloatArray:
 def _moved(sums: FloatArray, pose: Matrix, shape: tuple[int, ...]) -> FloatArray:
     """Sum and count (h, w, 2) on the grid where a map leads, zero outside."""
     grid = sums.shape[:2]
-    height, width = (np.arange(length, dtype=np.float32) for length in grid)
-    to = camera_flow(motion(pose), shape, grid) / np.float32(pixel_of(shape))
-    x, y = width + to[..., 0], height[:, None] + to[..., 1]
-    return cv2.remap(sums, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    to = camera_flow(motion(pose), shape, grid) * np.array([grid[1] / shape[1], grid[0] / shape[0]], np.float32)
+    x = np.arange(grid[1], dtype=np.float32) + to[..., 0]
+    y = np.arange(grid[0], dtype=np.float32)[:, None] + to[..., 1]
+    # OpenCV rounds positions in an image of two channels to 1/32 pixel.
+    planes = cv2.split(sums)
+    return cv2.merge([cv2.remap(one, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) for one in planes])

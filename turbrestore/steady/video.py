@@ -2,7 +2,8 @@
 
 1. A frame is freed of its turbulent displacement, and fused with its neighbours
    (:mod:`turbrestore.steady.dewarping`), as soon as the last of them is there.
-2. Where the scene is static it is fused with the memory of all frames before (:mod:`turbrestore.steady.memory`).
+2. Where the scene is static it is fused with the memory of all frames before (:mod:`turbrestore.steady.memory`), which
+   lies at the mean geometry of the frames around, if they can be read ahead (:mod:`turbrestore.steady.scene_mean`).
 3. One blur, estimated from an early frame of the clip, is removed from every frame by linear filters
    (:mod:`turbrestore.steady.deblurring`); from what is remembered, one that is estimated there.
 4. A title, where a static camera has drawn one, keeps the pixels of its frame (:mod:`turbrestore.footage.overlays`).
@@ -24,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..blur.posterior import BlurWitnesses, blur_posterior, estimate_posterior, measure_witnesses
 from ..blur.psf import KOLMOGOROV
 from ..core.arrays import FloatArray, luminance
-from ..core.errors import settings_of
+from ..core.errors import DataError, settings_of
 from ..core.noise import estimate_noise
 from ..core.noise_spectrum import white_noise
 from ..display.preview import summary
@@ -93,18 +94,19 @@ def steady_frames(
 ) -> Iterator[SteadyFrame]:
     """Steady a stream of frames, one output frame for each input frame.
 
-    Frames that can be read twice, as those of an array, a list or :func:`turbrestore.open_frames`, are placed in the
-    mean of up to 48 frames before and after them.  An iterator cannot, and its frames are placed by those before them
-    and ``params.reach`` frames after them, which leaves turbulence that moves the whole image slowly.
+    Frames that can be read twice, as those of an array, a list or :func:`turbrestore.open_frames`, are read ahead by 60
+    frames, and placed in the mean of about 48 frames before and after them.  The frames of an iterator, and all with
+    ``params.live``, are placed by those before them and their neighbours after them, which leaves turbulence that moves
+    the whole image slowly.
 
-    The output lags behind the input by ``params.reach`` frames and two for each thread, and at the start by half of
+    The output lags behind an iterator by ``params.reach`` frames and two for each thread, and at the start by half of
     ``params.reach`` more, because the blur is estimated there; with ``params.live`` by two frames.  Memory does not
     grow with the length of the stream.
 
     Parameters
     ----------
     frames : iterable of array_like, shape (H, W) or (H, W, 3)
-        Intensities in [0, 1]; consumed lazily, twice unless it is an iterator.
+        Intensities in [0, 1]; read lazily, and twice unless it is an iterator.
     params : SteadyParams, optional
         Settings.
     runtime : Runtime
@@ -117,7 +119,8 @@ def steady_frames(
     Raises
     ------
     DataError
-        Frames differ in size or are smaller than 16×16, or values are not finite or on another scale than 0 to 1.
+        Frames differ in size or are smaller than 16×16, values are not finite or on another scale than 0 to 1, or there
+        are fewer frames when they are read again.
     ConfigurationError
         Settings are of another type.
 
@@ -141,16 +144,32 @@ def steady_frames(
     scenes = _Scenes(params, width, said, runtime)
     if head:
         scenes.keep_title(head[-1])
-    # An iterator cannot be read twice.
-    means = repeat(None) if isinstance(frames, Iterator) else iter_scene_means(frames)
-    placed = zip(chain(head, windows), means, strict=False)
+    means = iter_scene_means(frames) if _can_be_read_twice(frames) else repeat(None)
     yield from map_in_turns(
         lambda pair: (dewarp_frame(pair[0], params), pair[1]),
         lambda pair: (pair[0], scenes.estimate(*pair)),
         lambda pair: _sharpened(*pair, width, exponent),
-        placed,
+        _paired(chain(head, windows), means),
         runtime.threads,
     )
+
+
+def _can_be_read_twice(frames: Iterable[ArrayLike]) -> bool:
+    return not isinstance(frames, Iterator) and iter(frames) is not iter(frames)
+
+
+def _paired(windows: Iterable[Window], means: Iterable[SceneMean | None]) -> Iterator[tuple[Window, SceneMean | None]]:
+    """Yield the window of every frame with the mean around it."""
+    means = iter(means)
+    for window in windows:
+        try:
+            mean = next(means)
+        except StopIteration:
+            found = f"only {window.number} the second time"
+            raise DataError(
+                f"frames: expected the same frames every time they are read, found {found}; pass iter(frames)"
+            ) from None
+        yield window, mean
 
 
 def _one_by_one(windows: Iterable[Window], params: SteadyParams, runtime: Runtime) -> Iterator[SteadyFrame]:
@@ -277,7 +296,7 @@ class _Scenes:
         return estimate, moving, self._remembered_width(self._memory), self._title
 
     def _follow(self, frame: DewarpedFrame, mean: SceneMean | None) -> tuple[Matrix, Matrix, Around | None]:
-        """Follow the camera: maps from the steadied frame to the one before, and to the dewarped frame; its place."""
+        """Follow the camera: maps from the steadied frame to the one before and to the dewarped one, the mean."""
         shape = frame.moving.shape
         position = camera_position(self._positions, frame.cameras) if mean is None else mean.position
         dewarped = homogeneous(frame.removed_camera)

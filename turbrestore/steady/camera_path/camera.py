@@ -72,6 +72,14 @@ def camera_size(matrix: Matrix, shape: tuple[int, ...]) -> float:
     return float(np.sqrt((matrix**2 * spread).sum()))
 
 
+def corner_motion(matrix: Matrix, shape: tuple[int, ...]) -> float:
+    """How far an affine flow moves the corners of an image at most along one axis, pixels.
+
+    ``matrix`` (2, 3).
+    """
+    return float((np.abs(matrix) @ [shape[1] / 2, shape[0] / 2, 1.0]).max())
+
+
 def _places(grid: tuple[int, ...], shape: tuple[int, ...]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Coordinates x and y of a grid over an image, pixels about the centre of the image."""
     pairs = zip(grid[:2], shape[:2], strict=True)

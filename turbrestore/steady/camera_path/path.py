@@ -22,9 +22,10 @@ with s² integrated out by the prior 1/s², is::
 
 (Rasmussen and Williams 2006, ch. 2.7 and 5.4; Wahba 1978 for W), and under it the mean of c_k is
 ``1ᵀ V⁻¹ y / 1ᵀ V⁻¹ 1``, since C is zero at frame k.  T is the mean over models and correlation times by their
-probability.  Each coefficient has its own, and the others have a say on the correlation time.  Of a model counts the
-share ``1 / (1 + (s / e)⁸)`` only, with ``s² = yᵀ Q y / (n − 1)``: what moves frames further than turbulence does is a
-camera that shakes, and stays as it is.
+probability.  Each coefficient has its own, and the others have a say on the correlation time.  A model is less
+probable, and moves frames less, by the share ``1 / (1 + (s / e)⁸)``, with ``s² = yᵀ Q y / (n − 1)``: what moves frames
+further than turbulence does is a camera that shakes, and stays as it is.  Positions have an error ε at random, which
+adds ``ε² tr Q`` to ``yᵀ Q y``.
 
 G_j is the median over the earlier neighbours of frame j of the map to them and on to frame j; those far away keep
 errors from adding up with every frame.  Where the frames can be read twice, they are placed in the mean of the scene
@@ -34,7 +35,7 @@ instead (:mod:`turbrestore.steady.scene_mean`).
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,7 +49,8 @@ _TIMES, _WALKS = (1.0, 3.0, 9.0), (1e-6, 1e-4, 1e-2, 1.0)
 # v, a frame: velocities and their changes are of this order times s.  Three times as much or a third changes paths by
 # 4 %, less rounds a sudden stop.  Frames from k at which a camera may turn.
 _VELOCITY, _TURNS = 5.0, tuple(range(-6, 7))
-# Distance up to which every frame counts, and every how many frames further away: those are as alike as they are many.
+# Distance up to which every frame counts, and every how many frames further away where all are known: successive ones
+# are alike.
 _NEAR, _EVERY = 12, 3
 _FEWEST = 4
 # Error of a position, pixels, which scatters at random, and least e.
@@ -81,7 +83,8 @@ def smooth_motion(path: Mapping[int, Matrix], tolerance: float, shape: tuple[int
 
     ``path`` (2, 3); returns (2, 3).
     """
-    times = tuple(sorted(time for time in {*path, 0} if abs(time) <= _NEAR or time % _EVERY == 0))
+    known = {*path, 0}
+    times = tuple(sorted(time for time in known if not _is_dense(time, known) or time % _EVERY == 0))
     if len(times) < _FEWEST:
         return np.zeros((2, 3))
     seen = np.stack([path[time] if time else np.zeros((2, 3)) for time in times])
@@ -100,6 +103,11 @@ def smooth_motion(path: Mapping[int, Matrix], tolerance: float, shape: tuple[int
     likely = np.exp(evidence + others[:, None] - np.max(of_time + others, axis=0)).reshape(variance.shape)
     smooth = np.einsum("mc,mc->c", likely / likely.sum(0) * share, models.here @ seen)
     return np.asarray(smooth.reshape(2, 3) / sizes, np.float64)
+
+
+def _is_dense(time: int, known: Set[int]) -> bool:
+    """Whether a time is far from the frame, and those beside it are known as well."""
+    return abs(time) > _NEAR and {time - 1, time + 1} <= known
 
 
 def without_shake(path: Mapping[int, Matrix], order: int) -> Matrix:
