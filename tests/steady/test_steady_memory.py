@@ -58,9 +58,8 @@ class TestMemory:
         for frame in [first] + [later] * 40:
             memory = remember(memory, frame, measure_flow, 0.0, 2.0, 1.0, still, STILL, STILL, around)
         shift = np.median(measure_flow(first, memory.image, np.zeros((72, 64, 2), np.float32))[8:-8, 8:-8, 0])
-        # The mean of the last frames without any flow, which the memory is checked against, lies one pixel to the right.
-        assert shift > 1.5 if trust else shift == pytest.approx(1, abs=0.1)
-        assert memory.replaced < 0.1
+        # The memory is checked against the last frames without any flow, one pixel to the right, and let go by and by.
+        assert 0.9 < shift < 1.1 if not trust else 1.5 < shift < 2.1
 
     def test_what_has_changed_passes_at_once(self):
         scene = photo(size=64)
