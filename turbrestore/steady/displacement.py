@@ -61,8 +61,8 @@ _AGREEMENT, _LONGEST_PATH = 0.5, 2.0
 _IMAGE_WINDOW, _DIFFERENCE = 2.0, 0.04
 # Every so many pixels of the grid enter the median.
 _SAMPLE = 3
-# Mean of |S_i| over |S_1| at which turbulence is half likely, and the least |S_1| that counts, pixels.
-_GROWTH, _LEAST_SIZE = 4.0, 0.1
+# Mean of |S_i| over |S_1| at which turbulence is half likely.
+_GROWTH = 4.0
 # What turbulence moves whole frames by, in medians of |S_i|.
 _WHOLE = 1.4
 
@@ -74,15 +74,22 @@ def mean_displacement(flows: Mapping[int, FloatArray], largest: float, path: Flo
     returns (h, w, 2).
     """
     static = 1 / (1 + (path / (_PATH * largest)) ** 4)
-    total, weights = 0.0, _OWN_SHARE
+    total = np.zeros((*path.shape, 2), np.float32)
+    weights = np.full((*path.shape, 1), _OWN_SHARE, np.float32)
     for offset in sorted({abs(offset) for offset in flows}):
         mean = _symmetric(flows, offset)
-        size = cv2.GaussianBlur(np.einsum("yxc,yxc->yx", mean, mean), (0, 0), _WINDOW / pixel)
-        weight = (1 / (1 + (size / largest**2) ** 2))[..., None]
+        weight = turbulent_weight(mean, largest, pixel)[..., None]
         if offset not in flows or -offset not in flows:
             weight *= static[..., None]
-        total, weights = total + weight * mean, weights + weight
+        total += weight * mean
+        weights += weight
     return np.asarray(total / weights, np.float32)
+
+
+def turbulent_weight(flow: FloatArray, largest: float, pixel: float) -> FloatArray:
+    """Weight (h, w) of a flow (h, w, 2), less where it is longer than turbulence displaces."""
+    square = cv2.GaussianBlur(np.einsum("yxc,yxc->yx", flow, flow), (0, 0), _WINDOW / pixel)
+    return np.asarray(1 / (1 + (square / largest**2) ** 2), np.float32)
 
 
 def displacement_sizes(flows: Mapping[int, FloatArray]) -> list[float]:
@@ -101,7 +108,7 @@ def likely_turbulence(sizes: Sequence[float]) -> float:
     A correlation time of 9 frames gives a mean of 2.2 |S_1|.  What lies at different distances from a camera that moves
     gives more, as its motion goes on growing with i.
     """
-    return float(1 / (1 + (np.mean(sizes) / (_GROWTH * max(sizes[0], _LEAST_SIZE))) ** 8))
+    return float(1 / (1 + (np.mean(sizes) / (_GROWTH * sizes[0] + np.finfo(float).eps)) ** 8))
 
 
 def largest_displacement(size: float, steadiness: float) -> float:

@@ -47,8 +47,9 @@ _DIFFERENCE_WINDOW, _SQUARE_WINDOW = 1.5, 2.0
 _DIFFERENCE, _MISREGISTRATION, _NOISE_SHARE = 0.02, 1.0, 0.5
 # κ and ς.  With a κ of 2 still scenes lose 0.1 dB, because a long memory lies off the mean of a few frames.
 _FURTHER, _SOFTER = 4.0, 3.0
-# e and s, squared intensity; windows of the images and of the mean, pixels of the grid.
-_EVEN, _FLAT = 1e-4, 1e-4
+# e and s, squared intensity.
+_EVEN = 1e-4
+# Windows of the images and of the mean, pixels of the grid.
 _IMAGE_WINDOW, _CHECKED_WINDOW = 1.0, 4.0
 # Energy of the gradient that white noise of unit variance has after the first window, by Sobel's derivatives.
 _OF_NOISE = 0.041
@@ -116,7 +117,7 @@ def share_of_estimate(estimate: FloatArray, frame: FloatArray, mean: FloatArray,
     further, near = (_averaged((one - middle) ** 2) for one in (ours, seen))
     sharp, was_sharp = (_averaged(x**2 + y**2) for x, y in map(sobel_gradient, (ours, seen)))
     distance = further / (_FURTHER * (near + _EVEN))
-    softness = (was_sharp - np.float32(_OF_NOISE * noise**2)) / (_SOFTER * (sharp + _FLAT))
+    softness = (was_sharp - np.float32(_OF_NOISE * noise**2)) / (_SOFTER * (sharp + _EVEN))
     return 1 / ((1 + distance**4) * (1 + np.maximum(softness, 0) ** 4))
 
 

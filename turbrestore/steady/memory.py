@@ -57,6 +57,7 @@ from ..core.arrays import FloatArray, luminance
 from ..registration.warp import inside, sample_linear, warp
 from .camera_path.camera import Matrix, camera_flow, corner_motion, fit_camera
 from .camera_path.path import motion
+from .displacement import turbulent_weight
 from .fusion import agreement_on_grid, agreement_weight, explained_difference, for_channels
 from .grid import enlarged, follow, grid_of, inverted, pixel_of, reduced
 from .scene_mean import SceneMean
@@ -67,8 +68,8 @@ Flow = Callable[..., FloatArray]
 
 # Longest memory, frames: a change of the light is followed as fast.
 _LONGEST = 64
-# Windows, pixels, in which |r|² is averaged, and from which r is filled in.
-_WINDOW, _SURROUNDINGS = 4.0, 12.0
+# Window from which r is filled in, pixels.
+_SURROUNDINGS = 12.0
 # Margin of what moves, and its soft edge, pixels.
 _MARGIN, _MARGIN_EDGE = np.ones((5, 5), np.uint8), 1.5
 # Window in which an object draws the flow of a flat background along.
@@ -147,7 +148,7 @@ def remember(
     agrees = 1 / (1 + (distances[..., 0] / (distances[..., 1] + _EVEN)) ** 4)
     tolerance = explained_difference(memory.image, noise)
     weight = agreement_weight(sample_linear((image,), enlarged(flow, shape)), memory.image, tolerance)
-    weight *= _turbulent(own, largest, pixel)
+    weight *= turbulent_weight(own, largest, pixel)
     # R follows a slow object from frame to frame, and would hold it back, and with it the flat background beside it.
     near, beside = _beside(moving)
     weight *= reduced((1 - cv2.GaussianBlur(near, (0, 0), _MARGIN_EDGE)) * agrees)
@@ -211,19 +212,13 @@ def _off_mean(
     mean = seen + known * (mean - seen)
     flow = flow_between(image, mean, np.zeros((*grid, 2), np.float32), shape)
     weight = agreement_on_grid(follow(mean, flow, shape) - seen, tolerance, pixel)
-    weight *= _turbulent(flow, around.largest, pixel) * known
+    weight *= turbulent_weight(flow, around.largest, pixel) * known
     return _filled(flow, np.where(beside, 0, weight), pixel)
 
 
 def _strength(largest: float) -> float:
     """Tell how much the memory counts, 0 where turbulence is weak and 1 where it is strong."""
     return float(np.clip((largest - _WEAK) / (_STRONG - _WEAK), 0, 1))
-
-
-def _turbulent(flow: FloatArray, largest: float, pixel: float) -> FloatArray:
-    """Weight of a flow (h, w, 2), less where it is longer than turbulence displaces."""
-    square = cv2.GaussianBlur(np.einsum("yxc,yxc->yx", flow, flow), (0, 0), _WINDOW / pixel)
-    return np.asarray(1 / (1 + (square / largest**2) ** 2), np.float32)
 
 
 def _beside(moving: NDArray[np.bool_]) -> tuple[FloatArray, NDArray[np.bool_]]:

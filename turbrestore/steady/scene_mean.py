@@ -36,15 +36,11 @@ from .dewarping import first_guess, measure_flow
 from .grid import grid_of, reduced
 from .windows import iter_scenes
 
-# Frames of a run, and frames that the running mean remembers.
-_RUN, _REMEMBERED = 12, LONGEST
-# Windows of the gradient and of its square, pixels of the grid; gradient, intensity a pixel, at which a place counts
-# half, and the weight of a flat one.  Half or twice the gradient does as well, four times leaves out too much.
-_GRADIENT_WINDOW, _TEXTURE_WINDOW, _FLAT, _LEAST_WEIGHT = 0.75, 3.0, 0.004, 1e-9
-# Least count of frames that is divided by.
-_LEAST_COUNT = 1e-3
-# Share of the shorter side by which the camera moves before the running mean follows it.
-_FOLLOWED = 1 / 16
+# Frames of a run.
+_RUN = 12
+# Window in which the square of the gradient is averaged, pixels of the grid, and the gradient, intensity a pixel, at
+# which a place counts half.  Half or twice as much does as well, four times leaves out too much.
+_TEXTURE_WINDOW, _FLAT = 3.0, 0.004
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +61,7 @@ class SceneMean:
         total, count = cv2.split(
             np.add.reduce([_moved(one.sums, one.position @ back, self.shape) for one in self.runs])
         )
-        return total / np.maximum(count, _LEAST_COUNT), np.minimum(count / _RUN, 1)
+        return total / np.maximum(count, 1), np.minimum(count / _RUN, 1)
 
 
 def iter_scene_means(frames: Iterable[ArrayLike]) -> Iterator[SceneMean]:
@@ -129,10 +125,11 @@ class _Camera:
             flow = measure_flow(mean, seen[..., 0], camera_flow(motion(expected), shape, mean.shape), shape)
             self._pose = homogeneous(fit_camera(flow, shape, _texture(mean)))
             self._sums += _moved(seen, self._pose, shape)
-            self._sums *= np.minimum(_REMEMBERED / self._sums[..., 1:], 1)
+            self._sums *= np.minimum(LONGEST / self._sums[..., 1:], 1)
         self._last = prepared
         position = self._pose @ self._start
-        if corner_motion(motion(self._pose), shape) > _FOLLOWED * min(shape):
+        # Before a tenth of the frame is out of sight.
+        if corner_motion(motion(self._pose), shape) > min(shape) / _RUN:
             self._move_to(seen, shape)
         return position
 
@@ -159,10 +156,9 @@ def _mean_around(number: int, positions: dict[int, Matrix], runs: deque[_Run], s
 
 def _texture(grey: FloatArray) -> FloatArray:
     """Weight (h, w) of the flow of an image, which is arbitrary where the image is flat."""
-    along_x, along_y = sobel_gradient(cv2.GaussianBlur(grey, (0, 0), _GRADIENT_WINDOW))
-    square = cv2.GaussianBlur(along_x**2 + along_y**2, (0, 0), _TEXTURE_WINDOW)
-    # A flat image has no more weight in one place than in another.
-    return np.asarray((square + _LEAST_WEIGHT) / (square + _FLAT**2), np.float32)
+    along_x, along_y = sobel_gradient(grey)
+    square = cv2.GaussianBlur(along_x**2 + along_y**2, (0, 0), _TEXTURE_WINDOW) + np.finfo(np.float32).eps
+    return np.asarray(square / (square + _FLAT**2), np.float32)
 
 
 def _moved(sums: FloatArray, pose: Matrix, shape: tuple[int, ...]) -> FloatArray:

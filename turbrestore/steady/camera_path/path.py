@@ -47,14 +47,14 @@ LONGEST = 48
 # Correlation times τ, frames, and ρ of the models: closer and wider grids give the same paths.
 _TIMES, _WALKS = (1.0, 3.0, 9.0), (1e-6, 1e-4, 1e-2, 1.0)
 # v, a frame: velocities and their changes are of this order times s.  Three times as much or a third changes paths by
-# 4 %, less rounds a sudden stop.  Frames from k at which a camera may turn.
-_VELOCITY, _TURNS = 5.0, tuple(range(-6, 7))
-# Distance up to which every frame counts, and every how many frames further away where all are known: successive ones
-# are alike.
-_NEAR, _EVERY = 12, 3
+# 4 %, less rounds a sudden stop.
+_VELOCITY = 5.0
+# Every how many frames count where all are known, further away than four times as many: successive ones are alike.
+# Up to twice as many from k a camera may turn.
+_EVERY = 3
 _FEWEST = 4
-# Error of a position, pixels, which scatters at random, and least e.
-_ERROR, _LEAST = 0.03, 1e-3
+# Error ε of a position, and the least e, pixels.
+_ERROR = 0.03
 
 
 def camera_position(before: Sequence[Matrix], cameras: Mapping[int, Matrix]) -> Matrix:
@@ -94,7 +94,7 @@ def smooth_motion(path: Mapping[int, Matrix], tolerance: float, shape: tuple[int
     squares = np.einsum("tc,mtu,uc->mc", seen, models.left, seen)
     squares += _ERROR**2 * np.trace(models.left, axis1=1, axis2=2)[:, None]
     variance = squares / (len(times) - 1)
-    share = 1 / (1 + (variance / max(tolerance, _LEAST) ** 2) ** 4)
+    share = 1 / (1 + (variance / max(tolerance, _ERROR) ** 2) ** 4)
     evidence = models.evidence[:, None] - (len(times) - 1) / 2 * np.log(variance) + np.log(share)
     evidence = evidence.reshape(len(_TIMES), -1, seen.shape[1])
     # Turbulence has one correlation time, of which the other coefficients on average tell as much as this one.
@@ -107,7 +107,7 @@ def smooth_motion(path: Mapping[int, Matrix], tolerance: float, shape: tuple[int
 
 def _is_dense(time: int, known: Set[int]) -> bool:
     """Whether a time is far from the frame, and those beside it are known as well."""
-    return abs(time) > _NEAR and {time - 1, time + 1} <= known
+    return abs(time) > 4 * _EVERY and {time - 1, time + 1} <= known
 
 
 def without_shake(path: Mapping[int, Matrix], order: int) -> Matrix:
@@ -158,14 +158,15 @@ def _models(times: tuple[int, ...]) -> _Models:
     total = air[:, None] + smooth
     inverse, logarithm = np.linalg.inv(total), np.linalg.slogdet(total)[1]
     # A turn adds a product of vectors to the covariance of the line (Sherman and Morrison 1950).
-    turns = np.stack([np.clip((time - bend) * (1 if bend >= 0 else -1), 0, None) for bend in _TURNS])
+    bends = range(-2 * _EVERY, 2 * _EVERY + 1)
+    turns = np.stack([np.clip((time - bend) * (1 if bend >= 0 else -1), 0, None) for bend in bends])
     along = np.einsum("atu,bu->abt", inverse[:, 1], _VELOCITY * turns)
     growth = 1 + np.einsum("abt,bt->ab", along, _VELOCITY * turns)
     turned = inverse[:, 1, None] - along[..., None] * along[:, :, None] / growth[..., None, None]
     inverse = np.concatenate([inverse, turned], 1).reshape(-1, *line.shape)
     logarithm = np.concatenate([logarithm, logarithm[:, 1, None] + np.log(growth)], 1).ravel()
     # Resting, constant velocity, all walks and all turns are as probable a priori.
-    counts = [1, 1, *[len(_WALKS)] * len(_WALKS), *[len(_TURNS)] * len(_TURNS)]
+    counts = [1, 1, *[len(_WALKS)] * len(_WALKS), *[len(turns)] * len(turns)]
     ones = inverse.sum(2)
     left = inverse - ones[:, :, None] * ones[:, None] / ones.sum(1)[:, None, None]
     evidence = -np.tile(np.log(counts), len(_TIMES)) - (logarithm + np.log(ones.sum(1))) / 2
