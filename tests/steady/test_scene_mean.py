@@ -58,6 +58,15 @@ def test_path_and_mean_are_those_of_the_frames_around():
         assert psnr(image[:, :-5], frames[number][:, 5:], known[:, :-5] == 1) > 32
 
 
+def test_small_motion_of_the_camera_is_not_rounded():
+    ramp = np.tile(np.linspace(0, 1, SIZE, dtype=np.float32), (SIZE, 1))
+    mean = next(iter_scene_means([ramp] * 12))
+    for shift in (0.01, 0.02, 0.05):
+        moved = mean.seen_from(np.array([[1, 0, shift], [0, 1, 0], [0, 0, 1]]))[0]
+        found = (moved - ramp)[8:-8, 8:-8].mean() * (SIZE - 1)
+        assert found == pytest.approx(shift, abs=0.002)
+
+
 def test_air_averages_out_of_the_mean():
     truth, _ = pan(1, 0.0)
     seen = through_air(truth * 60, 1.5, 0)
