@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from turbrestore.steady.camera_path.camera import camera_size
 from turbrestore.steady.camera_path.path import LONGEST, _models, smooth_motion
 from turbrestore.steady.displacement import camera_steadiness, displacement_sizes, likely_turbulence, whole_displacement
 from turbrestore.steady.settings import SteadyParams
@@ -135,3 +136,25 @@ def test_displacements_that_grow_with_the_distance_in_time_are_no_turbulence():
         alike, twice = np.exp(-times / correlated), np.exp(-2 * times / correlated)
         assert likely_turbulence(np.sqrt(1.5 + twice / 2 - 2 * alike).tolist()) > 0.95
     assert likely_turbulence((0.06 * times**1.5).tolist()) < 0.01
+
+
+def coefficients(values):
+    """Path whose six coefficients have these values (times, 2, 3), scaled to pixels, from the frame in the middle."""
+    sizes = np.array([camera_size(np.outer([1, 0], unit), SHAPE) for unit in np.eye(3)])
+    middle = len(values) // 2
+    return {k - middle: (one - values[middle]) / sizes for k, one in enumerate(values) if k != middle}
+
+
+def test_a_sway_in_a_pan_is_told_from_wander_by_the_correlation_time_of_the_other_coefficients():
+    rng, times, ends = np.random.default_rng(0), np.arange(-48, 49), []
+    for _ in range(60):
+        values = rng.standard_normal((97, 2, 3))
+        values[:, 0, 2] = 0.4 * values[:, 0, 2] + 0.8 * np.sin(times / 6 + rng.uniform(0, 6)) + 0.1 * times
+        ends.append(values[48, 0, 2] + smooth_motion(coefficients(values), 4.0, SHAPE)[0, 2])
+    # The sway has 0.57 pixels; alone, this coefficient keeps 0.18.
+    assert np.std(ends) > 0.4
+
+
+def test_a_camera_that_shakes_further_than_turbulence_is_left_as_it_is():
+    values = 3 * np.random.default_rng(1).standard_normal((97, 2, 3))
+    assert np.abs(smooth_motion(coefficients(values), 0.3, SHAPE)).max() < 0.01

@@ -10,10 +10,11 @@ from shaken_scenes import photo, psnr
 from turbrestore.core.errors import DataError
 from turbrestore.steady.camera_path.camera import fit_camera
 from turbrestore.steady.camera_path.path import LONGEST
-from turbrestore.steady.dewarping import measure_flow
+from turbrestore.steady.dewarping import dewarp_frame, measure_flow
 from turbrestore.steady.scene_mean import iter_scene_means
 from turbrestore.steady.settings import SteadyParams
 from turbrestore.steady.video import steady_frames
+from turbrestore.steady.windows import iter_windows
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
 SIZE = 96
@@ -58,6 +59,21 @@ def test_path_and_mean_are_those_of_the_frames_around():
         assert psnr(image[:, :-5], frames[number][:, 5:], known[:, :-5] == 1) > 32
 
 
+def test_a_camera_is_followed_by_what_has_texture():
+    scene, rng = np.full((160, 160), 0.5, np.float32), np.random.default_rng(0)
+    scene[110:130, 40:120] = cv2.GaussianBlur(photo(size=160), (0, 0), 1.0)[110:130, 40:120]
+    shake = np.cumsum(rng.normal(0, 1.5, (30, 2)), 0)
+    shake -= shake[0]
+    frames = [
+        cv2.warpAffine(scene, np.array([[1, 0, -30 - x], [0, 1, -50 - y]]), (SIZE, SIZE))
+        + rng.normal(0, 0.005, (SIZE, SIZE))
+        for x, y in shake
+    ]
+    found = np.array([mean.position[:2, 2] for mean in iter_scene_means(np.clip(frames, 0, 1))])
+    # 2.6 pixels by all of the flow.
+    assert np.sqrt(np.square(found + shake).mean()) < 1
+
+
 def test_small_motion_of_the_camera_is_not_rounded():
     ramp = np.tile(np.linspace(0, 1, SIZE, dtype=np.float32), (SIZE, 1))
     mean = next(iter_scene_means([ramp] * 12))
@@ -96,6 +112,21 @@ def test_frames_that_can_be_read_twice_lie_nearer_to_their_place():
         for given in (seen, iter(seen))
     ]
     assert errors[0] < 0.7 * errors[1]
+
+
+def test_near_and_far_things_before_a_swaying_camera_are_no_turbulence():
+    near, far = (cv2.GaussianBlur(photo(name, 288), (0, 0), 1.0) for name in ("brick", "camera"))
+    frames = []
+    for sway in 12 * np.sin(np.arange(30) / 4):
+        places = [np.array([[1, 0, -60 - times * sway], [0, 1, -60]]) for times in (1, 3)]
+        frame, beside = (cv2.warpAffine(*pair, (160, 160)) for pair in zip((far, near), places, strict=True))
+        frame[:, :80] = beside[:, :80]
+        frames.append(frame)
+    still = through_air(pan(1, 0.0)[0] * 30, 1.5, 3)
+    windows = [list(iter_windows(clip, SteadyParams().distances))[16] for clip in (frames, still)]
+    parallax, air = (dewarp_frame(window, SteadyParams(sigma=0)).turbulence for window in windows)
+    assert parallax < 0.1
+    assert air > 0.9
 
 
 def test_colour_on_a_coarser_grid_is_placed_as_well():

@@ -52,6 +52,7 @@ _VELOCITY = 5.0
 # Every how many frames count where all are known, further away than four times as many: successive ones are alike.
 # Up to twice as many from k a camera may turn.
 _EVERY = 3
+# Fewest times that a path is smoothed over.
 _FEWEST = 4
 # Error ε of a position, and the least e, pixels.
 _ERROR = 0.03
