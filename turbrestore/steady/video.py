@@ -4,7 +4,7 @@
    (:mod:`turbrestore.steady.dewarping`), as soon as the last of them is there.
 2. Where the scene is static it is fused with the memory of all frames before (:mod:`turbrestore.steady.memory`), which
    lies at the mean geometry of the frames around, if they can be read ahead (:mod:`turbrestore.steady.scene_mean`).
-3. One blur, estimated from an early frame of the clip, is removed from every frame by linear filters
+3. One blur, estimated from early frames of the clip, is removed from every frame by linear filters
    (:mod:`turbrestore.steady.deblurring`); from what is remembered, one that is estimated there.
 4. A title, where a static camera has drawn one, keeps the pixels of its frame (:mod:`turbrestore.footage.overlays`).
 
@@ -49,8 +49,10 @@ from .windows import Window, iter_windows, relit
 
 # Median of the squared distance from the centre of a normal distribution in the plane, over the variance along an axis.
 _MEDIAN_SQUARE = 2 * np.log(2)
-# Frames that the memory holds on average when the width of its blur is estimated, and frames over which the width that
-# is removed goes there, so that no frame is suddenly sharper.
+# Frames of a file whose windows tell the width of its blur: how many, and how far apart.  Single ones scatter by a fifth.
+_WITNESSES, _APART = 3, 18
+# Age of the memory, frames, at which the width of its blur is estimated, and frames over which the width that is removed
+# goes there, so that no frame is suddenly sharper.
 _REMEMBERED, _GRADUALLY = 24, 16
 
 
@@ -137,14 +139,18 @@ def steady_frames(
         return
     # The first frame that has neighbours on both sides.
     head = list(islice(windows, params.reach // 2 + 1))
+    twice = _can_be_read_twice(frames)
     sigma, exponent, said = params.sigma, KOLMOGOROV, None
     if head and sigma is None:
-        sigma, exponent, said = _find_first(head[-1], params, runtime)
+        again = iter_windows(frames, params.distances) if twice and len(head) > params.reach // 2 else iter(())
+        apart = islice(again, head[-1].number + _APART, head[-1].number + _WITNESSES * _APART, _APART)
+        found = sorted((_find_first(window, params, runtime) for window in chain(head[-1:], apart)), key=lambda one: one[0])
+        sigma, exponent, said = found[(len(found) - 1) // 2]
     width = sigma or 0.0
     scenes = _Scenes(params, width, said, runtime)
     if head:
         scenes.keep_title(head[-1])
-    means = iter_scene_means(frames) if _can_be_read_twice(frames) else repeat(None)
+    means = iter_scene_means(frames) if twice else repeat(None)
     yield from map_in_turns(
         lambda pair: (dewarp_frame(pair[0], params), pair[1]),
         lambda pair: (pair[0], scenes.estimate(*pair)),
@@ -322,8 +328,8 @@ class _Scenes:
 
     def _remembered_width(self, memory: Memory) -> float:
         """Width to remove from what is remembered, which gradually becomes the one that its own image needs."""
-        count = float(memory.held.mean())
-        if self._said is not None and self._found is None and count >= _REMEMBERED:
+        if self._said is not None and self._found is None and memory.frames >= _REMEMBERED:
+            count = float(memory.held.mean())
             # An image that does not determine its width says nothing against the one that was found before.
             self._found = max(_find_blur(memory.image, self._said, count, self._runtime)[0], self._first)
         if self._found is not None:
