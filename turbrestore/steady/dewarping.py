@@ -7,8 +7,8 @@ F_i : flow from frame k to frame k + i, pixels
 D : mean displacement of frame k to its neighbours (:mod:`turbrestore.steady.displacement`), about −d_k
 V : its inverse map, ``(id + D) ∘ (id + V) = id``, about d_k
 
-1. F_i is measured by dense inverse search, and its affine part, the camera, is taken off
-   (:mod:`turbrestore.steady.camera_path.camera`).
+1. F_i is measured by dense inverse search, for an earlier neighbour as the inverse of the flow from there; its affine
+   part, the camera, is taken off (:mod:`turbrestore.steady.camera_path.camera`).
 2. ``J = I_k ∘ (id + V)`` is the frame without its turbulent displacement.
 3. ``J_i = I_{k+i} ∘ (id + F_i) ∘ (id + V)`` are its neighbours, registered to it; those that agree are averaged with it
    (:mod:`turbrestore.steady.fusion`).
@@ -49,7 +49,7 @@ from .displacement import (
 from .fusion import fuse
 from .grid import enlarged, follow, grid_of, inverted, pixel_of, reduced
 from .settings import SteadyParams
-from .windows import Window, WindowFrame, light_between, normalised_grey, relit
+from .windows import MeasuredFlows, Window, WindowFrame, light_between, normalised_grey, relit
 
 # Patches this sparse lose nothing on phase screens; closer ones take a fifth longer.
 _FLOW = DisParams(finest_scale=0, patch_size=8, patch_stride=4, refinements=1, smoothness=10.0)
@@ -161,25 +161,45 @@ def _solver(normalised: GreyImage, shape: tuple[int, ...]) -> Callable[[GreyImag
     return lambda other, start: pixel * solve(other[None], [start / pixel], False)[0]
 
 
-def _measure(window: Window) -> tuple[dict[int, FloatArray], dict[int, Matrix]]:
-    """Flow from the frame to each neighbour, and its affine part.
+def _measure(window: Window) -> MeasuredFlows:
+    """Flow from the frame to each neighbour, and its affine part.  Earlier ones have theirs to the frame."""
+    shape, left = window.frame.image.shape, dict[int, WindowFrame]()
+    known = window.later.measured(_search)
+    flows, cameras = known[0].copy(), known[1].copy()
+    for offset, other in window.earlier.items():
+        towards = other.measured(_search)[0].get(-offset)
+        if towards is None:
+            left[offset] = window.neighbours[offset]
+        else:
+            flows[offset] = inverted(towards, shape)
+            cameras[offset] = fit_camera(flows[offset], shape)
+    further = _search(window.frame, left, cameras)
+    return flows | further[0], cameras | further[1]
+
+
+def _search(
+    frame: WindowFrame, neighbours: Mapping[int, WindowFrame], known: Mapping[int, Matrix] | None = None
+) -> MeasuredFlows:
+    """Flow from a frame to its neighbours, and its affine part, which of others may be known.
 
     A pan leads far in a dozen frames, so the search for a far neighbour starts where the camera would be if it went on
     as it went to the one before.
     """
-    normalised, shape = window.frame.normalised, window.frame.image.shape
-    solve = _solver(normalised, shape)
+    if not neighbours:
+        return {}, {}
+    shape, grid = frame.image.shape, frame.normalised.shape
+    solve = _solver(frame.normalised, shape)
     flows: dict[int, FloatArray] = {}
-    cameras: dict[int, Matrix] = {}
-    for offset in sorted(window.neighbours, key=abs):
-        neighbour = window.neighbours[offset]
+    cameras = dict(known or {})
+    for offset in sorted(neighbours, key=abs):
+        neighbour = neighbours[offset]
         if any(offset * other > 0 for other in cameras):
             expected = expected_motion(cameras, offset)
         else:
-            expected = first_guess(window.frame.shift_reference, neighbour.shift_reference, neighbour.image)
-        flows[offset] = solve(neighbour.normalised, camera_flow(expected, shape, normalised.shape))
+            expected = first_guess(frame.shift_reference, neighbour.shift_reference, neighbour.image)
+        flows[offset] = solve(neighbour.normalised, camera_flow(expected, shape, grid))
         cameras[offset] = fit_camera(flows[offset], shape)
-    return flows, cameras
+    return flows, {offset: cameras[offset] for offset in flows}
 
 
 def first_guess(reference: ShiftReference, prepared: ShiftReference, image: FloatArray) -> Matrix:

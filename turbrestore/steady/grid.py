@@ -48,7 +48,8 @@ def follow(field: FloatArray, flow: FloatArray, shape: tuple[int, ...]) -> Float
 def inverted(flow: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     """Flow (h, w, 2) of the inverse map, on the grid of an image of this shape."""
     size = _pixel(flow, shape)
-    return size * invert_flow(flow / size)
+    # Every step leaves a share of the error as large as the flow stretches by: a third of 8 pixels ends at 0.03.
+    return size * invert_flow(flow / size, iterations=5)
 
 
 def _pixel(flow: FloatArray, shape: tuple[int, ...]) -> FloatArray:

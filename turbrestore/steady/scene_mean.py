@@ -70,17 +70,19 @@ def iter_scene_means(frames: Iterable[ArrayLike]) -> Iterator[SceneMean]:
     ``frames`` (H, W) or (H, W, 3) each.
     """
     for _, scene in groupby(iter_scenes(frames), lambda numbered: numbered[1]):
-        yield from _means_of_scene(image for image, _ in scene)
+        yield from _means_of_scene((image, blank) for image, _, blank in scene)
 
 
-def _means_of_scene(images: Iterable[FloatArray]) -> Iterator[SceneMean]:
+def _means_of_scene(images: Iterable[tuple[FloatArray, bool]]) -> Iterator[SceneMean]:
     positions: dict[int, Matrix] = {}
     runs: deque[_Run] = deque()
     camera, due, shape = _Camera(), 0, (0, 0)
-    for number, image in enumerate(images):
+    for number, (image, blank) in enumerate(images):
         shape = image.shape[:2]
         seen = cv2.merge([luminance(reduced(image)), np.ones(grid_of(shape), np.float32)])
-        positions[number] = camera.follow(image, seen)
+        # A blank frame, which never is the first of a scene, lies where the one before does, and adds nothing.
+        positions[number] = positions[number - 1] if blank else camera.follow(image, seen)
+        seen *= not blank
         if number % _RUN == 0:
             runs.append(_Run(number, positions[number], np.zeros_like(seen)))
         runs[-1].add(seen, positions[number], shape)

@@ -49,9 +49,7 @@ from .windows import Window, iter_windows, relit
 
 # Median of the squared distance from the centre of a normal distribution in the plane, over the variance along an axis.
 _MEDIAN_SQUARE = 2 * np.log(2)
-# Frames of a file whose windows tell the width of its blur: how many, and how far apart.  Single ones scatter by a fifth.
-_WITNESSES, _APART = 3, 18
-# Age of the memory, frames, at which the width of its blur is estimated, and frames over which the width that is removed
+# Frames since the memory began when the width of its blur is estimated, and frames over which the width that is removed
 # goes there, so that no frame is suddenly sharper.
 _REMEMBERED, _GRADUALLY = 24, 16
 
@@ -142,10 +140,7 @@ def steady_frames(
     twice = _can_be_read_twice(frames)
     sigma, exponent, said = params.sigma, KOLMOGOROV, None
     if head and sigma is None:
-        again = iter_windows(frames, params.distances) if twice and len(head) > params.reach // 2 else iter(())
-        apart = islice(again, head[-1].number + _APART, head[-1].number + _WITNESSES * _APART, _APART)
-        found = sorted((_find_first(window, params, runtime) for window in chain(head[-1:], apart)), key=lambda one: one[0])
-        sigma, exponent, said = found[(len(found) - 1) // 2]
+        sigma, exponent, said = _find_median(head[-1], frames if twice else (), params, runtime)
     width = sigma or 0.0
     scenes = _Scenes(params, width, said, runtime)
     if head:
@@ -199,6 +194,19 @@ class WindowWitnesses:
 
     of_image: BlurWitnesses  # about that of an image fused from them
     usual: float  # median of the displacement by the air, as a variance along an axis, squared pixels
+
+
+def _find_median(
+    window: Window, again: Iterable[ArrayLike], params: SteadyParams, runtime: Runtime
+) -> tuple[float, float, WindowWitnesses]:
+    """Blur of the window whose width is the median, of this one and the next two that share no frame.
+
+    The widths that single windows of one clip tell differ by a fifth or more.  Of two, the narrower is taken.
+    """
+    apart = 2 * params.reach + 1
+    later = islice(iter_windows(again, params.distances), window.number + apart, window.number + 3 * apart, apart)
+    found = [_find_first(one, params, runtime) for one in chain([window], later)]
+    return sorted(found, key=lambda one: one[0])[(len(found) - 1) // 2]
 
 
 def _find_first(window: Window, params: SteadyParams, runtime: Runtime) -> tuple[float, float, WindowWitnesses]:
@@ -277,6 +285,13 @@ class _Scenes:
         if frame.starts_scene:
             self._memory, self._width, self._found = None, self._first, None
             self._positions.clear()
+        if frame.seen.blank:
+            # What is remembered waits for the next frame.
+            still = np.eye(3)
+            alone = remember(
+                None, frame.image, measure_flow, frame.noise, frame.largest, 0.0, frame.moving, still, still
+            )
+            return alone, frame.moving, self._width, self._title
         carry, offset, around = self._follow(frame, mean)
         image, moving = frame.image, frame.moving
         if self._params.camera != "keep":

@@ -7,8 +7,9 @@ scene only.
 
 from __future__ import annotations
 
+import threading
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -17,12 +18,17 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_stream, check_unit_image, luminance
 from ..core.errors import DataError
+from ..footage.checks.content import BLANK_CONTRAST
 from ..footage.checks.scene_cuts import similarity_at, thumbnail
 from ..registration.camera.global_shift import ShiftReference, prepare_shift_reference
 from ..registration.flow import MIN_SIDE, normalise_to_8_bits
 from ..registration.flow_methods.opencv_flow import GreyImage
 from ..runtime.image_stacks import spline_planes
+from .camera_path.camera import Matrix
 from .grid import pixel_of, reduced
+
+# Flows (h, w, 2) from a frame to its neighbours, and their affine parts (2, 3), by their distance in frames.
+MeasuredFlows = tuple[dict[int, FloatArray], dict[int, Matrix]]
 
 # Likeness of two successive frames below which the second starts a new scene.
 _CUT = 0.5
@@ -49,7 +55,27 @@ class WindowFrame:
     normalised: GreyImage  # (h, w): luminance of normalised local contrast, which flow is measured from
     coarse: FloatArray  # (h', w') or (h', w', 3): means of squares, which light is measured from
     scene: int  # number of the scene, from 0
+    blank: bool  # whether it shows nothing of its scene
     shift_reference: ShiftReference  # what shifts of the whole image are measured against
+
+
+class LaterFlows:
+    """Flows from a frame to its later neighbours: whoever needs them first measures them.
+
+    Reversed, they lead from those neighbours to the frame, whose windows other threads work on.
+    """
+
+    def __init__(self, frame: WindowFrame, neighbours: Mapping[int, WindowFrame]) -> None:
+        self._lock = threading.Lock()
+        self._of: tuple[WindowFrame, Mapping[int, WindowFrame]] | None = frame, neighbours
+        self._found: MeasuredFlows = {}, {}
+
+    def measured(self, measure: Callable[[WindowFrame, Mapping[int, WindowFrame]], MeasuredFlows]) -> MeasuredFlows:
+        """Flows, and the motion of the camera, by the distance of the neighbours."""
+        with self._lock:
+            if self._of is not None:
+                self._found, self._of = measure(*self._of), None
+            return self._found
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +86,8 @@ class Window:
     frame: WindowFrame
     neighbours: Mapping[int, WindowFrame]  # by their distance in frames, negative before the frame
     starts_scene: bool  # whether the frame is the first of its scene
+    later: LaterFlows
+    earlier: Mapping[int, LaterFlows]  # of the neighbours before the frame
 
 
 def iter_windows(
@@ -72,26 +100,31 @@ def iter_windows(
     offsets = sorted([-distance for distance in earlier] + list(earlier if later is None else later), key=abs)
     before, after = -min(offsets), max(offsets)
     kept: deque[WindowFrame] = deque()
+    flows: dict[int, LaterFlows] = {}
     # Number of the first frame that is kept, and of the next one whose window is due.
     first = due = 0
     for frame in _prepared(frames):
         kept.append(frame)
         if len(kept) + first > due + after:
-            yield _window(kept, first, due, offsets)
+            yield _window(kept, flows, first, due, offsets)
             due += 1
         if len(kept) > before + after:
             kept.popleft()
+            flows.pop(first, None)
             first += 1
     for number in range(due, first + len(kept)):
-        yield _window(kept, first, number, offsets)
+        yield _window(kept, flows, first, number, offsets)
 
 
-def iter_scenes(frames: Iterable[ArrayLike]) -> Iterator[tuple[FloatArray, int]]:
-    """Yield every frame (H, W) or (H, W, 3) with the number of its scene, from 0.
+def iter_scenes(frames: Iterable[ArrayLike]) -> Iterator[tuple[FloatArray, int, bool]]:
+    """Yield every frame (H, W) or (H, W, 3) with the number of its scene, from 0, and whether it is blank.
+
+    The first frame of a scene never is.
 
     Raises DataError for a frame that differs from the first in size, is too small for flow, or is no image.
     """
-    scene, before, shape = 0, None, None
+    scene, usual, shape = 0, 0.0, None
+    before = faint = np.zeros((1, 1), np.float32)
     for number, values in enumerate(check_stream(frames)):
         image = check_unit_image(values, f"frame {number}")
         shape = shape or image.shape
@@ -102,10 +135,18 @@ def iter_scenes(frames: Iterable[ArrayLike]) -> Iterator[tuple[FloatArray, int]]
             raise DataError(f"frames: expected at least {MIN_SIDE}×{MIN_SIDE} pixels for optical flow, found {found}")
         detail = thumbnail(image)
         detail = detail - cv2.GaussianBlur(detail, (0, 0), _SHADING)
-        if before is not None and np.any(before) and np.any(detail):
+        contrast = float(detail.std())
+        if usual and contrast <= BLANK_CONTRAST * usual:
+            # Noise differs from frame to frame; what does not is a scene of little contrast.
+            alike = np.any(faint) and np.any(detail) and similarity_at(detail, faint)[0] >= _CUT
+            faint = detail
+            if not alike:
+                yield image, scene, True
+                continue
+        if usual:
             scene += similarity_at(detail, before)[0] < _CUT
-        before = detail
-        yield image, scene
+        before, usual, faint = detail, contrast, np.zeros_like(detail)
+        yield image, scene, False
 
 
 def normalised_grey(grey: FloatArray, shape: tuple[int, ...]) -> GreyImage:
@@ -161,20 +202,24 @@ def relit(image: FloatArray, gain: FloatArray) -> FloatArray:
     return scaled.reshape(image.shape)
 
 
-def _window(kept: deque[WindowFrame], first: int, number: int, offsets: Sequence[int]) -> Window:
+def _window(
+    kept: deque[WindowFrame], flows: dict[int, LaterFlows], first: int, number: int, offsets: Sequence[int]
+) -> Window:
+    """Window of a frame; the flows from it to later ones are added to those that are kept."""
     place = number - first
     frame = kept[place]
-    neighbours = {
-        offset: kept[place + offset]
-        for offset in offsets
-        if 0 <= place + offset < len(kept) and kept[place + offset].scene == frame.scene
-    }
-    return Window(number, frame, neighbours, number == 0 or kept[place - 1].scene != frame.scene)
+    there = {offset: kept[place + offset] for offset in offsets if 0 <= place + offset < len(kept)}
+    neighbours = {offset: other for offset, other in there.items() if other.scene == frame.scene and not other.blank}
+    flows[number] = LaterFlows(frame, {offset: other for offset, other in neighbours.items() if offset > 0})
+    earlier = {offset: flows[number + offset] for offset in neighbours if offset < 0}
+    starts_scene = number == 0 or kept[place - 1].scene != frame.scene
+    return Window(number, frame, neighbours, starts_scene, flows[number], earlier)
 
 
 def _prepared(frames: Iterable[ArrayLike]) -> Iterator[WindowFrame]:
-    for image, scene in iter_scenes(frames):
+    for image, scene, blank in iter_scenes(frames):
         grey = luminance(reduced(image))
         normalised = normalised_grey(grey, image.shape)
         shift_reference = prepare_shift_reference(image)
-        yield WindowFrame(image, spline_planes(image), grey, normalised, coarse_image(image), scene, shift_reference)
+        coarse = coarse_image(image)
+        yield WindowFrame(image, spline_planes(image), grey, normalised, coarse, scene, blank, shift_reference)

@@ -42,7 +42,7 @@ from .scene_cuts import MOST_SCENES, Scene, SceneDetector, group_scenes, thumbna
 from .stuck_pixels import StuckPixelDetector, repair_stuck
 
 # Blank frames have at most this contrast or share of the median contrast; share of saturated pixels that is named.
-_LEAST_CONTRAST, _BLANK_CONTRAST, _SATURATED = 1 / 510, 0.1, 0.5
+_LEAST_CONTRAST, BLANK_CONTRAST, _SATURATED = 1 / 510, 0.1, 0.5
 # What to do with an array in place of a source.
 _OPENED = "use open_frames(path) or FrameSource.from_array(frames)"
 
@@ -194,7 +194,7 @@ def without_blank(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...
     """Leave out frames that show nothing; a source without any is returned as it is."""
     contrasts = np.array([thumbnail(frame).std() for frame in source], np.float64)
     blank = np.asarray(source.numbers)[_are_blank(contrasts)].tolist()
-    choice, reason = f"{numbers_text(blank)} left out", f"at most {_BLANK_CONTRAST:.0%} of the usual contrast"
+    choice, reason = f"{numbers_text(blank)} left out", f"at most {BLANK_CONTRAST:.0%} of the usual contrast"
     found = Decision("blank frames", choice, reason)
     return (source.without(blank, f"{choice}: {reason}"), (found,)) if blank else (source, ())
 
@@ -251,7 +251,7 @@ class _ContentScan:
         self._contrasts.append(contrast := float(thumb.std()))
         # A running estimate of the median, because blank frames must reach neither the scenes nor the stuck pixels.
         self._usual += 0.1 * (max(contrast, _LEAST_CONTRAST) - self._usual) if self._usual else contrast
-        if contrast > max(_LEAST_CONTRAST, _BLANK_CONTRAST * self._usual):
+        if contrast > max(_LEAST_CONTRAST, BLANK_CONTRAST * self._usual):
             # Stuck pixels are isolated in the mosaic; interpolation of colours spreads them.
             self._stuck.update(values if mosaic is None else self._planes(mosaic))
             self._scenes.update(thumb)
@@ -384,5 +384,5 @@ def _how_filled(report: ContentReport) -> str:
 
 def _are_blank(contrasts: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Tell which frames are blank by their contrasts; none where all would be."""
-    blank = contrasts <= _BLANK_CONTRAST * np.median(contrasts)
+    blank = contrasts <= BLANK_CONTRAST * np.median(contrasts)
     return np.asarray(blank & ~blank.all())
