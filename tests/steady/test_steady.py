@@ -232,6 +232,13 @@ class TestStream:
         assert max(ahead[10:]) <= delay
         assert max(kept) <= 4 * params.reach + 6
 
+    def test_the_blur_of_a_file_is_the_median_of_windows(self):
+        scene = photo()
+        frames = shaken([cv2.GaussianBlur(scene, (0, 0), 1.0 if number < 12 else 1.8) for number in range(28)])
+        params = SteadyParams(reach=4)
+        of_file, of_pipe = (next(steady_frames(one, params)).sigma for one in (frames, iter(frames)))
+        assert of_file > of_pipe + 0.3
+
     def test_a_live_stream_is_deblurred_once_its_blur_is_known(self):
         soft = cv2.GaussianBlur(photo(), (0, 0), 1.6)
         sigmas = [frame.sigma for frame in steady_frames(shaken([soft] * 9), SteadyParams(reach=6, live=True))]

@@ -379,6 +379,8 @@ def _sharpened(
     memory, moving, width, title = estimate
     noise = frame.noise * frame.share
     remembered = noise / float(np.sqrt(memory.held.mean()))
+    # What is remembered tells the blur where few frames did not.
+    sigma = sigma or round(width, 2)
     sharp = deblur(memory.image, (sigma, round(width, 2)), exponent, (noise, remembered), memory.held)
     image = relit(sharp, frame.light)
     if title is not None:
