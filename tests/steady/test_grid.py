@@ -3,10 +3,13 @@
 import cv2
 import numpy as np
 import pytest
+from shaken_scenes import photo, shaken
 
 from turbrestore.registration.flow_algebra import compose_flows
 from turbrestore.steady.camera_path.camera import camera_flow, fit_camera
+from turbrestore.steady.dewarping import _measure
 from turbrestore.steady.grid import enlarged, follow, grid_of, inverted, reduced
+from turbrestore.steady.windows import iter_windows
 
 TURN = np.array([[0.01, 0.02, 1.5], [-0.02, 0.005, -0.7]])
 
@@ -31,3 +34,19 @@ def test_flows_of_the_grid_are_pixels_of_the_image():
     # What leads out of the image has no inverse.
     both = compose_flows(enlarged(flow, shape), enlarged(inverted(flow, shape), shape))
     assert np.abs(both)[8:-8, 8:-8].max() < 5e-3
+
+
+def test_a_flow_that_stretches_by_a_third_is_inverted():
+    shape = (128, 192)
+    y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
+    flow = np.stack([8 * np.sin(x / 24) * np.cos(y / 24), 5 * np.cos(x / 30)], -1).astype(np.float32)
+    both = compose_flows(flow, enlarged(inverted(cv2.resize(flow, grid_of(shape)[::-1]), shape), shape))
+    assert np.abs(both)[16:-16, 16:-16].max() < 0.15
+
+
+def test_flow_to_an_earlier_frame_undoes_that_from_there():
+    frames = shaken([photo()] * 3, rms=2.0)
+    windows = list(iter_windows(frames, (1, 2)))
+    later, earlier = (enlarged(_measure(windows[k])[0][2 - 2 * k], frames[0].shape) for k in (0, 2))
+    assert np.abs(compose_flows(later, earlier))[8:-8, 8:-8].mean() < 0.02
+    assert np.abs(later + earlier)[8:-8, 8:-8].mean() > 0.1

@@ -162,17 +162,15 @@ def _solver(normalised: GreyImage, shape: tuple[int, ...]) -> Callable[[GreyImag
 
 
 def _measure(window: Window) -> MeasuredFlows:
-    """Flow from the frame to each neighbour, and its affine part.  Earlier ones have theirs to the frame."""
-    shape, left = window.frame.image.shape, dict[int, WindowFrame]()
-    known = window.later.measured(_search)
+    """Flow from the frame to each neighbour, and its affine part; to earlier ones it is that from there, inverted."""
+    shape, known = window.frame.image.shape, window.later.measured(_search)
     flows, cameras = known[0].copy(), known[1].copy()
     for offset, other in window.earlier.items():
         towards = other.measured(_search)[0].get(-offset)
-        if towards is None:
-            left[offset] = window.neighbours[offset]
-        else:
+        if towards is not None:
             flows[offset] = inverted(towards, shape)
             cameras[offset] = fit_camera(flows[offset], shape)
+    left = {offset: frame for offset, frame in window.neighbours.items() if offset not in flows}
     further = _search(window.frame, left, cameras)
     return flows | further[0], cameras | further[1]
 
@@ -180,7 +178,7 @@ def _measure(window: Window) -> MeasuredFlows:
 def _search(
     frame: WindowFrame, neighbours: Mapping[int, WindowFrame], known: Mapping[int, Matrix] | None = None
 ) -> MeasuredFlows:
-    """Flow from a frame to its neighbours, and its affine part, which of others may be known.
+    """Flow from a frame to its neighbours, and its affine part; that to other neighbours may be ``known``.
 
     A pan leads far in a dozen frames, so the search for a far neighbour starts where the camera would be if it went on
     as it went to the one before.

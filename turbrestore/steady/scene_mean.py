@@ -19,7 +19,7 @@ The frames are read once more for this, ahead of those that are steadied.  Memor
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass
 from itertools import groupby
 
@@ -75,22 +75,27 @@ def iter_scene_means(frames: Iterable[ArrayLike]) -> Iterator[SceneMean]:
 
 def _means_of_scene(images: Iterable[tuple[FloatArray, bool]]) -> Iterator[SceneMean]:
     positions: dict[int, Matrix] = {}
+    blanks: set[int] = set()
     runs: deque[_Run] = deque()
     camera, due, shape = _Camera(), 0, (0, 0)
     for number, (image, blank) in enumerate(images):
         shape = image.shape[:2]
         seen = cv2.merge([luminance(reduced(image)), np.ones(grid_of(shape), np.float32)])
-        # A blank frame, which never is the first of a scene, lies where the one before does, and adds nothing.
-        positions[number] = positions[number - 1] if blank else camera.follow(image, seen)
-        seen *= not blank
+        # A blank frame, which never is the first of a scene, tells no place and adds nothing.
+        if blank:
+            positions[number] = positions[number - 1]
+            blanks.add(number)
+            seen *= 0
+        else:
+            positions[number] = camera.follow(image, seen)
         if number % _RUN == 0:
             runs.append(_Run(number, positions[number], np.zeros_like(seen)))
         runs[-1].add(seen, positions[number], shape)
         while (number + 1) % _RUN == 0 and due + LONGEST <= number:
-            yield _mean_around(due, positions, runs, shape)
+            yield _mean_around(due, positions, blanks, runs, shape)
             due += 1
     for last in range(due, max(positions, default=-1) + 1):
-        yield _mean_around(last, positions, runs, shape)
+        yield _mean_around(last, positions, blanks, runs, shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +147,9 @@ class _Camera:
         self._start, self._pose = self._pose @ self._start, np.eye(3)
 
 
-def _mean_around(number: int, positions: dict[int, Matrix], runs: deque[_Run], shape: tuple[int, ...]) -> SceneMean:
+def _mean_around(
+    number: int, positions: dict[int, Matrix], blanks: Set[int], runs: deque[_Run], shape: tuple[int, ...]
+) -> SceneMean:
     """Mean around the next frame; what lies too far back is dropped."""
     positions.pop(number - LONGEST - 1, None)
     while runs[0].start + _RUN <= number - LONGEST:
@@ -151,7 +158,7 @@ def _mean_around(number: int, positions: dict[int, Matrix], runs: deque[_Run], s
     path = {
         other - number: motion(position @ back)
         for other, position in positions.items()
-        if 0 < abs(other - number) <= LONGEST
+        if 0 < abs(other - number) <= LONGEST and other not in blanks
     }
     return SceneMean(positions[number], path, tuple(runs), shape)
 

@@ -94,10 +94,10 @@ def steady_frames(
 ) -> Iterator[SteadyFrame]:
     """Steady a stream of frames, one output frame for each input frame.
 
-    Frames that can be read twice, as those of an array, a list or :func:`turbrestore.open_frames`, are read ahead by 60
-    frames, and placed in the mean of about 48 frames before and after them.  The frames of an iterator, and all with
-    ``params.live``, are placed by those before them and their neighbours after them, which leaves turbulence that moves
-    the whole image slowly.
+    Frames that can be read again, as those of an array, a list or :func:`turbrestore.open_frames`, are read ahead by 60
+    frames, once more at the start for the blur, and placed in the mean of about 48 frames before and after them.  The
+    frames of an iterator, and all with ``params.live``, are placed by those before them and their neighbours after
+    them, which leaves turbulence that moves the whole image slowly.
 
     The output lags behind an iterator by ``params.reach`` frames and two for each thread, and at the start by half of
     ``params.reach`` more, because the blur is estimated there; with ``params.live`` by two frames.  Memory does not
@@ -106,7 +106,7 @@ def steady_frames(
     Parameters
     ----------
     frames : iterable of array_like, shape (H, W) or (H, W, 3)
-        Intensities in [0, 1]; read lazily, and twice unless it is an iterator.
+        Intensities in [0, 1]; read lazily, and more than once unless it is an iterator.
     params : SteadyParams, optional
         Settings.
     runtime : Runtime
@@ -140,7 +140,8 @@ def steady_frames(
     twice = _can_be_read_twice(frames)
     sigma, exponent, said = params.sigma, KOLMOGOROV, None
     if head and sigma is None:
-        sigma, exponent, said = _find_median(head[-1], frames if twice else (), params, runtime)
+        seen = [window for window in head if not window.frame.blank]
+        sigma, exponent, said = _find_median(seen[-1], frames if twice else (), params, runtime)
     width = sigma or 0.0
     scenes = _Scenes(params, width, said, runtime)
     if head:
@@ -166,7 +167,7 @@ def _paired(windows: Iterable[Window], means: Iterable[SceneMean | None]) -> Ite
         try:
             mean = next(means)
         except StopIteration:
-            found = f"only {window.number} the second time"
+            found = f"only {window.number} another time"
             raise DataError(
                 f"frames: expected the same frames every time they are read, found {found}; pass iter(frames)"
             ) from None
@@ -175,11 +176,12 @@ def _paired(windows: Iterable[Window], means: Iterable[SceneMean | None]) -> Ite
 
 def _one_by_one(windows: Iterable[Window], params: SteadyParams, runtime: Runtime) -> Iterator[SteadyFrame]:
     """Frames of a live stream, each before the next is asked for.  OpenCV shares out what one frame takes."""
-    sigma, exponent = params.sigma or 0.0, KOLMOGOROV
+    sigma, exponent, unknown = params.sigma or 0.0, KOLMOGOROV, True
     scenes = _Scenes(params, sigma, None, runtime)
     with nullcontext() if runtime.threads != 1 else one_thread_each():
         for window in windows:
-            if window.number == params.reach // 2:
+            if unknown and window.number >= params.reach // 2 and not window.frame.blank:
+                unknown = False
                 scenes.keep_title(window)
                 if params.sigma is None:
                     sigma, exponent, said = _find_first(window, params, runtime)
@@ -199,13 +201,18 @@ class WindowWitnesses:
 def _find_median(
     window: Window, again: Iterable[ArrayLike], params: SteadyParams, runtime: Runtime
 ) -> tuple[float, float, WindowWitnesses]:
-    """Blur of the window whose width is the median, of this one and the next two that share no frame.
+    """Blur of the window whose width is the median, of this one and up to two later ones of its scene.
 
-    The widths that single windows of one clip tell differ by a fifth or more.  Of two, the narrower is taken.
+    They share no frame.  The widths that single windows of one clip tell differ by a fifth or more.  Of two, the
+    narrower is taken.
     """
     apart = 2 * params.reach + 1
-    later = islice(iter_windows(again, params.distances), window.number + apart, window.number + 3 * apart, apart)
-    found = [_find_first(one, params, runtime) for one in chain([window], later)]
+    later = islice(iter_windows(again, params.distances), window.number + apart, window.number + 2 * apart + 1, apart)
+    usable = [
+        one for one in later if one.frame.scene == window.frame.scene and one.neighbours.keys() >= set(params.distances)
+    ]
+    # Alone, a window takes fewer searches than its earlier neighbours would for the flows that are inverted.
+    found = [_find_first(replace(one, earlier={}), params, runtime) for one in (window, *usable)]
     return sorted(found, key=lambda one: one[0])[(len(found) - 1) // 2]
 
 
@@ -286,12 +293,13 @@ class _Scenes:
             self._memory, self._width, self._found = None, self._first, None
             self._positions.clear()
         if frame.seen.blank:
-            # What is remembered waits for the next frame.
+            # What is remembered waits for the next frame, and nothing tells that the camera has moved.
+            self._positions.append(self._positions[-1])
             still = np.eye(3)
             alone = remember(
                 None, frame.image, measure_flow, frame.noise, frame.largest, 0.0, frame.moving, still, still
             )
-            return alone, frame.moving, self._width, self._title
+            return alone, frame.moving, 0.0, self._title
         carry, offset, around = self._follow(frame, mean)
         image, moving = frame.image, frame.moving
         if self._params.camera != "keep":
@@ -379,9 +387,10 @@ def _sharpened(
     memory, moving, width, title = estimate
     noise = frame.noise * frame.share
     remembered = noise / float(np.sqrt(memory.held.mean()))
-    # What is remembered tells the blur where few frames did not.
-    sigma = sigma or round(width, 2)
-    sharp = deblur(memory.image, (sigma, round(width, 2)), exponent, (noise, remembered), memory.held)
+    width = round(width, 2)
+    # What is remembered tells the blur where few frames did not; a blank frame shows none.
+    sigma = 0.0 if frame.seen.blank else sigma or width
+    sharp = deblur(memory.image, (sigma, width), exponent, (noise, remembered), memory.held)
     image = relit(sharp, frame.light)
     if title is not None:
         image = replace(title, frame=frame.seen.image).put_back(image)

@@ -1,8 +1,9 @@
 """Windows of a stream of frames: each frame with its neighbours in the same scene, as soon as they are there.
 
-Memory is bounded by the frames of two windows, however long the stream is.  A frame that is unlike the one before, as
-thumbnails show it (:mod:`turbrestore.footage.checks.scene_cuts`), starts a new scene; a window holds frames of one
-scene only.
+Memory is bounded by the frames of two windows and the flows between them, however long the stream is.  A frame that is
+unlike the one before, as thumbnails show it (:mod:`turbrestore.footage.checks.scene_cuts`), starts a new scene; a
+window holds frames of one scene only.  Frames that show nothing in between, as a flash or a dropout, are blank: they
+end no scene and have no neighbours.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from ..core.arrays import FloatArray, check_stream, check_unit_image, luminance
 from ..core.errors import DataError
-from ..footage.checks.content import BLANK_CONTRAST
+from ..footage.checks.content import BLANK_CONTRAST, LEAST_CONTRAST
 from ..footage.checks.scene_cuts import similarity_at, thumbnail
 from ..registration.camera.global_shift import ShiftReference, prepare_shift_reference
 from ..registration.flow import MIN_SIDE, normalise_to_8_bits
@@ -117,9 +118,10 @@ def iter_windows(
 
 
 def iter_scenes(frames: Iterable[ArrayLike]) -> Iterator[tuple[FloatArray, int, bool]]:
-    """Yield every frame (H, W) or (H, W, 3) with the number of its scene, from 0, and whether it is blank.
+    """Yield every frame (H, W) or (H, W, 3) with the number of its scene, from 0, and whether it is blank in it.
 
-    The first frame of a scene never is.
+    No scene begins with a blank frame: black ones at the start are a scene of their own, and of a scene of little
+    contrast the first frame counts as a blank one of the scene before.
 
     Raises DataError for a frame that differs from the first in size, is too small for flow, or is no image.
     """
@@ -136,16 +138,19 @@ def iter_scenes(frames: Iterable[ArrayLike]) -> Iterator[tuple[FloatArray, int, 
         detail = thumbnail(image)
         detail = detail - cv2.GaussianBlur(detail, (0, 0), _SHADING)
         contrast = float(detail.std())
+        if contrast <= LEAST_CONTRAST:
+            contrast, detail = 0.0, np.zeros_like(detail)
         if usual and contrast <= BLANK_CONTRAST * usual:
             # Noise differs from frame to frame; what does not is a scene of little contrast.
-            alike = np.any(faint) and np.any(detail) and similarity_at(detail, faint)[0] >= _CUT
+            alike = np.any(detail) and np.any(faint) and similarity_at(detail, faint)[0] >= _CUT
             faint = detail
             if not alike:
                 yield image, scene, True
                 continue
-        if usual:
-            scene += similarity_at(detail, before)[0] < _CUT
-        before, usual, faint = detail, contrast, np.zeros_like(detail)
+        cut = number > 0 and contrast > 0 and similarity_at(detail, before)[0] < _CUT
+        scene += cut
+        # A scene that fades out keeps its contrast, so that noise does not become one.
+        before, usual = detail, contrast if cut else max(usual, contrast)
         yield image, scene, False
 
 
@@ -209,7 +214,11 @@ def _window(
     place = number - first
     frame = kept[place]
     there = {offset: kept[place + offset] for offset in offsets if 0 <= place + offset < len(kept)}
-    neighbours = {offset: other for offset, other in there.items() if other.scene == frame.scene and not other.blank}
+    neighbours = {
+        offset: other
+        for offset, other in there.items()
+        if other.scene == frame.scene and not (frame.blank or other.blank)
+    }
     flows[number] = LaterFlows(frame, {offset: other for offset, other in neighbours.items() if offset > 0})
     earlier = {offset: flows[number + offset] for offset in neighbours if offset < 0}
     starts_scene = number == 0 or kept[place - 1].scene != frame.scene

@@ -42,7 +42,7 @@ from .scene_cuts import MOST_SCENES, Scene, SceneDetector, group_scenes, thumbna
 from .stuck_pixels import StuckPixelDetector, repair_stuck
 
 # Blank frames have at most this contrast or share of the median contrast; share of saturated pixels that is named.
-_LEAST_CONTRAST, BLANK_CONTRAST, _SATURATED = 1 / 510, 0.1, 0.5
+LEAST_CONTRAST, BLANK_CONTRAST, _SATURATED = 1 / 510, 0.1, 0.5
 # What to do with an array in place of a source.
 _OPENED = "use open_frames(path) or FrameSource.from_array(frames)"
 
@@ -250,8 +250,8 @@ class _ContentScan:
             self._shown = shown
         self._contrasts.append(contrast := float(thumb.std()))
         # A running estimate of the median, because blank frames must reach neither the scenes nor the stuck pixels.
-        self._usual += 0.1 * (max(contrast, _LEAST_CONTRAST) - self._usual) if self._usual else contrast
-        if contrast > max(_LEAST_CONTRAST, BLANK_CONTRAST * self._usual):
+        self._usual += 0.1 * (max(contrast, LEAST_CONTRAST) - self._usual) if self._usual else contrast
+        if contrast > max(LEAST_CONTRAST, BLANK_CONTRAST * self._usual):
             # Stuck pixels are isolated in the mosaic; interpolation of colours spreads them.
             self._stuck.update(values if mosaic is None else self._planes(mosaic))
             self._scenes.update(thumb)
