@@ -12,7 +12,8 @@ from turbrestore.core.errors import DataError
 from turbrestore.runtime.runtime import Runtime
 from turbrestore.steady.dewarping import dewarp_frame
 from turbrestore.steady.settings import SteadyParams
-from turbrestore.steady.video import _find_witnesses, steady_frames
+from turbrestore.steady.video import steady_frames
+from turbrestore.steady.window_blur import _witnesses_of_window
 from turbrestore.steady.windows import iter_windows
 from turbrestore.synthesis.anisoplanatic import phase_screen_frames
 from turbrestore.synthesis.atmosphere import PhaseScreenParams
@@ -78,7 +79,7 @@ def test_neither_objects_nor_the_camera_add_to_the_displacement_by_the_air(case)
                 image[50:78, 4 * number : 4 * number + 28] = photo("brick", 28)
             truth.append(image)
         window = list(iter_windows(shaken(truth, rms=0.6), (1, 3, 6)))[6]
-        return _find_witnesses(window, truth[6]).usual
+        return _witnesses_of_window(window, truth[6]).usual
 
     assert usual(0.004 * (case != "object"), case != "zoom") == pytest.approx(usual(0, False), rel=0.5)
 

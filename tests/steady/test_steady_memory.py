@@ -14,7 +14,8 @@ from turbrestore.steady.dewarping import measure_flow
 from turbrestore.steady.memory import Around, Memory, remember
 from turbrestore.steady.scene_mean import iter_scene_means
 from turbrestore.steady.settings import SteadyParams
-from turbrestore.steady.video import WindowWitnesses, _find_blur, _Scenes
+from turbrestore.steady.video import _Scenes
+from turbrestore.steady.window_blur import WindowWitnesses, find_blur_of_image
 
 STILL = np.eye(3)
 
@@ -117,7 +118,7 @@ def test_width_of_what_is_remembered_gradually_becomes_that_of_its_own_image():
     assert width(scenes, soft, 1) == 0.8
     widths = [width(scenes, soft, 30) for _ in range(80)]
     assert 0 < max(np.diff([0.8, *widths])) < 0.1
-    assert widths[-1] == pytest.approx(_find_blur(soft, said, 30, runtime)[0], abs=0.02)
+    assert widths[-1] == pytest.approx(find_blur_of_image(soft, said, 30, runtime)[0], abs=0.02)
     given = _Scenes(SteadyParams(sigma=0.8), 0.8, None, runtime)
     assert width(given, soft, 30) == 0.8
     flat = _Scenes(SteadyParams(), 0.8, said, runtime)
@@ -133,7 +134,7 @@ def test_noise_of_what_is_remembered_is_that_of_a_mean_of_the_frames_it_holds(mo
         frames.append(witnesses.independent_frames)
         return None, None
 
-    monkeypatch.setattr("turbrestore.steady.video.estimate_posterior", estimate)
+    monkeypatch.setattr("turbrestore.steady.window_blur.estimate_posterior", estimate)
     scenes, held = _Scenes(SteadyParams(), 0.8, said, Runtime(threads=1)), np.full((SIZE, SIZE), 36, np.float32)
     scenes._remembered_width(Memory(photo(), held, 36, STILL, photo(), np.zeros((SIZE, SIZE, 2)), 0.0))
     assert noises == [pytest.approx(0.04 / 6)]

@@ -4,8 +4,8 @@
    (:mod:`turbrestore.steady.dewarping`), as soon as the last of them is there.
 2. Where the scene is static it is fused with the memory of all frames before (:mod:`turbrestore.steady.memory`), which
    lies at the mean geometry of the frames around, if they can be read ahead (:mod:`turbrestore.steady.scene_mean`).
-3. One blur, estimated from early frames of the clip, is removed from every frame by linear filters
-   (:mod:`turbrestore.steady.deblurring`); from what is remembered, one that is estimated there.
+3. One blur, which windows of frames tell (:mod:`turbrestore.steady.window_blur`), is removed from every frame by linear
+   filters (:mod:`turbrestore.steady.deblurring`); from what is remembered, one that is estimated there.
 4. A title, where a static camera has drawn one, keeps the pixels of its frame (:mod:`turbrestore.footage.overlays`).
 
 What is carried from frame to frame is the memory, the blurs and, where the camera is locked, its path.
@@ -22,12 +22,9 @@ from itertools import chain, islice, repeat
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..blur.posterior import BlurWitnesses, blur_posterior, estimate_posterior, measure_witnesses
 from ..blur.psf import KOLMOGOROV
 from ..core.arrays import FloatArray, luminance
 from ..core.errors import DataError, settings_of
-from ..core.noise import estimate_noise
-from ..core.noise_spectrum import white_noise
 from ..display.preview import summary
 from ..footage.overlays import Title, find_title
 from ..footage.survey import take_survey
@@ -35,20 +32,19 @@ from ..io.source import FrameSource
 from ..registration.warp import sample_linear, warp
 from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import map_in_turns, one_thread_each
-from .camera_path.camera import Matrix, camera_flow, fit_camera
+from .camera_path.camera import Matrix, camera_flow
 from .camera_path.path import LONGEST, camera_position, homogeneous, longer_path, motion, smooth_motion
 from .deblurring import deblur
 from .dewarping import DewarpedFrame, dewarp_frame, measure_flow
 from .displacement import largest_displacement, whole_displacement
 from .fusion import for_channels, share_of_estimate
-from .grid import enlarged, follow, grid_of, pixel_of, reduced
+from .grid import enlarged, follow, pixel_of, reduced
 from .memory import Around, Memory, remember, shown
 from .scene_mean import SceneMean, iter_scene_means
 from .settings import SteadyParams
+from .window_blur import WindowWitnesses, find_blur_of_image, find_blur_of_window, find_blur_of_windows
 from .windows import Window, iter_windows, relit
 
-# Median of the squared distance from the centre of a normal distribution in the plane, over the variance along an axis.
-_MEDIAN_SQUARE = 2 * np.log(2)
 # Frames since the memory began when the width of its blur is estimated, and frames over which the width that is removed
 # goes there, so that no frame is suddenly sharper.
 _REMEMBERED, _GRADUALLY = 24, 16
@@ -141,7 +137,7 @@ def steady_frames(
     sigma, exponent, said = params.sigma, KOLMOGOROV, None
     if head and sigma is None:
         seen = [window for window in head if not window.frame.blank]
-        sigma, exponent, said = _find_median(seen[-1], frames if twice else (), params, runtime)
+        sigma, exponent, said = find_blur_of_windows(seen[-1], frames if twice else (), params, runtime)
     width = sigma or 0.0
     scenes = _Scenes(params, width, said, runtime)
     if head:
@@ -184,77 +180,10 @@ def _one_by_one(windows: Iterable[Window], params: SteadyParams, runtime: Runtim
                 unknown = False
                 scenes.keep_title(window)
                 if params.sigma is None:
-                    sigma, exponent, said = _find_first(window, params, runtime)
+                    sigma, exponent, said = find_blur_of_window(window, params, runtime)
                     scenes.remove(sigma, said)
             frame = dewarp_frame(window, params)
             yield _sharpened(frame, scenes.estimate(frame, None), sigma, exponent)
-
-
-@dataclass(frozen=True, eq=False)
-class WindowWitnesses:
-    """What the frames of a window say about their blur."""
-
-    of_image: BlurWitnesses  # about that of an image fused from them
-    usual: float  # median of the displacement by the air, as a variance along an axis, squared pixels
-
-
-def _find_median(
-    window: Window, again: Iterable[ArrayLike], params: SteadyParams, runtime: Runtime
-) -> tuple[float, float, WindowWitnesses]:
-    """Blur of the window whose width is the median, of this one and up to two later ones of its scene.
-
-    They share no frame.  The widths that single windows of one clip tell differ by a fifth or more.  Of two, the
-    narrower is taken.
-    """
-    apart = 2 * params.reach + 1
-    later = islice(iter_windows(again, params.distances), window.number + apart, window.number + 2 * apart + 1, apart)
-    usable = [
-        one for one in later if one.frame.scene == window.frame.scene and one.neighbours.keys() >= set(params.distances)
-    ]
-    # Alone, a window takes fewer searches than its earlier neighbours would for the flows that are inverted.
-    found = [_find_first(replace(one, earlier={}), params, runtime) for one in (window, *usable)]
-    return sorted(found, key=lambda one: one[0])[(len(found) - 1) // 2]
-
-
-def _find_first(window: Window, params: SteadyParams, runtime: Runtime) -> tuple[float, float, WindowWitnesses]:
-    """Width and exponent of the blur of all frames, from one with neighbours on both sides, and what witnesses say."""
-    image = dewarp_frame(window, params).image
-    said = _find_witnesses(window, image)
-    return *_find_blur(image, said, said.of_image.independent_frames, runtime), said
-
-
-def _find_witnesses(window: Window, image: FloatArray) -> WindowWitnesses:
-    """Measure what the frames of a window, registered to the image fused from them, say about their blur."""
-    frames = np.stack([window.frame.image, *(frame.image for frame in window.neighbours.values())])
-    still, count = np.zeros((*grid_of(image.shape), 2), np.float32), float(len(frames))
-    coarse = [measure_flow(image, frame, still) for frame in frames]
-    flows = np.stack([enlarged(flow, image.shape) for flow in coarse])
-    displacement = float(np.square(flows - np.median(flows, axis=(1, 2), keepdims=True)).mean())
-    # The median leaves out objects, and flat parts, whose flow is arbitrary.
-    own = np.stack([flow - camera_flow(fit_camera(flow, image.shape), image.shape, flow.shape) for flow in coarse])
-    usual = float(np.median(np.square(own).sum(-1))) / _MEDIAN_SQUARE
-    return WindowWitnesses(measure_witnesses(frames, flows, image, BlurWitnesses(displacement, count)), usual)
-
-
-def _find_blur(image: FloatArray, said: WindowWitnesses, count: float, runtime: Runtime) -> tuple[float, float]:
-    """Return width and exponent of the blur to remove from a mean of so many frames.
-
-    A window has few frames.  Where something moves or they are registered badly, they seem to vary, and the posterior
-    is too wide; where the scene is soft, so is what the image says.  Edges tell that nothing has blurred, and the
-    usual displacement how much the air can have blurred.  The least of the three widths is removed.
-    """
-    grey, witnesses = luminance(image), said.of_image
-    noise = white_noise(estimate_noise(grey))
-    if witnesses.frame_noise is not None:
-        noise = witnesses.frame_noise.scaled(1 / count)
-    variation = None if witnesses.variation is None else replace(witnesses.variation, frames=round(count))
-    witnesses = replace(witnesses, independent_frames=count, variation=variation)
-    evidence, posterior = estimate_posterior(grey, witnesses, noise, runtime, cautious=True)
-    if evidence is None:
-        return 0.0, KOLMOGOROV
-    ratio = None if variation is None else variation.with_power(grey)
-    of_air = blur_posterior(evidence, replace(witnesses, displacement=said.usual), ratio).by_displacement[1]
-    return min(posterior.removed, evidence.estimate.removable, float(of_air)), posterior.exponent
 
 
 class _Scenes:
@@ -354,7 +283,7 @@ class _Scenes:
         if self._said is not None and self._found is None and memory.frames >= _REMEMBERED:
             count = float(memory.held.mean())
             # An image that does not determine its width says nothing against the one that was found before.
-            self._found = max(_find_blur(memory.image, self._said, count, self._runtime)[0], self._first)
+            self._found = max(find_blur_of_image(memory.image, self._said, count, self._runtime)[0], self._first)
         if self._found is not None:
             self._width += (self._found - self._width) / _GRADUALLY
         return self._width
