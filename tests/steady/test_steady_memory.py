@@ -113,16 +113,19 @@ def test_width_of_what_is_remembered_gradually_becomes_that_of_its_own_image():
     scenes = _Scenes(SteadyParams(), 0.8, said, runtime)
 
     def width(scenes, image, held):
-        return scenes._remembered_width(Memory(image, held * short, held, STILL, image, np.zeros((SIZE, SIZE, 2)), 0.0))
+        frames = 3 * held
+        return scenes._remembered_width(
+            Memory(image, held * short, frames, STILL, image, np.zeros((SIZE, SIZE, 2)), 0.0)
+        )
 
     assert width(scenes, soft, 1) == 0.8
-    widths = [width(scenes, soft, 30) for _ in range(80)]
+    widths = [width(scenes, soft, 10) for _ in range(80)]
     assert 0 < max(np.diff([0.8, *widths])) < 0.1
-    assert widths[-1] == pytest.approx(find_blur_of_image(soft, said, 30, runtime)[0], abs=0.02)
+    assert widths[-1] == pytest.approx(find_blur_of_image(soft, said, 10, runtime)[0], abs=0.02)
     given = _Scenes(SteadyParams(sigma=0.8), 0.8, None, runtime)
-    assert width(given, soft, 30) == 0.8
+    assert width(given, soft, 10) == 0.8
     flat = _Scenes(SteadyParams(), 0.8, said, runtime)
-    assert width(flat, 0 * soft, 30) == 0.8
+    assert width(flat, 0 * soft, 10) == 0.8
 
 
 def test_noise_of_what_is_remembered_is_that_of_a_mean_of_the_frames_it_holds(monkeypatch):
