@@ -48,8 +48,7 @@ def find_blur_of_windows(
     apart = 2 * params.reach + 1
     later = islice(iter_windows(again, params.distances), window.number + apart, window.number + 2 * apart + 1, apart)
     usable = [one for one in later if one.frame.scene == window.frame.scene and max(one.neighbours, default=0) > 0]
-    # Alone, a window takes fewer searches than its earlier neighbours would for the flows that are inverted.
-    found = [find_blur_of_window(replace(one, earlier={}), params, runtime) for one in (window, *usable)]
+    found = [find_blur_of_window(one, params, runtime) for one in (window, *usable)]
     return sorted(found, key=lambda one: one[0])[(len(found) - 1) // 2]
 
 
