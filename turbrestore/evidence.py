@@ -32,7 +32,7 @@ from .verification.halves import MOSTLY, Guarded, disputed_detail, keep_agreed
 from .verification.structure import compare_structure
 from .wording import explain_few_frames, explain_seeing, explain_structure
 
-# Least variance of the noise of dark parts, relative to that of bright ones, that the decision states.
+# Least variance of the noise of dark parts, relative to that of bright ones, that the decision states, chosen.
 _LEAST_SHARE = 0.01
 # Least standard deviation of ln V, the displacement that D/r0 implies: theory and simulated clips agree no better.
 _LEAST_SPREAD = 0.2

@@ -26,6 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .core.arrays import PART
 from .core.decision import Decision
 from .core.errors import ConfigurationError, DataError, require
 from .deblurring.remove_blur import SMALLEST_SIDE, remove_blur_memory
@@ -43,14 +44,17 @@ from .runtime.tiling import HALO, halo_tiles, largest_tile
 from .settings import RestoreParams
 from .verification.halves import keep_agreed_memory
 
+# Half of a clip trains, but no fewer frames than the first and no more than the second; both chosen.
 _FEWEST_TRAINED, _MOST_TRAINED = 40, 100
-# Fewer training frames than these are not worth a lower limit.
+# Fewer training frames than these are not worth a lower limit, chosen.
 _FEWEST_IN_NEED = 10
-# Most that training frames and their flows take where no limit is given, bytes.
+# Most that training frames and their flows take where no limit is given, bytes, chosen.
 _TRAINING_BYTES = 1.5e9
-# Peak without a limit from which training frames go to a scratch file, bytes; required free space as a multiple of it.
+# Peak without a limit from which training frames go to a scratch file, bytes; required free space as a multiple of it;
+# both chosen.
 _SPILL_ABOVE_BYTES, _FREE_SPACE_FACTOR = 2.2e9, 3
-# Interpreter, libraries and readers, bytes.
+# Interpreter, libraries and readers, bytes.  Runs at their limits in benchmarks/results/memory.md show that this and
+# what follows down to the report suffice, but not that less would not.
 _BASE = 1.6e8
 # Memory of the preparation, bytes a pixel and bytes a pixel and channel.
 _PREPARED, _PREPARED_COLOUR = 44, 34
@@ -60,11 +64,11 @@ _RESULTS, _RESULTS_COLOUR = 60, 48
 _RESULTS_OF_TILES, _RESULTS_OF_TILES_COLOUR = 3, 23
 # A report with its pictures, which are at most 2048 pixels wide: bytes, bytes a pixel and a pixel that is shown.
 _REPORT, _REPORT_PIXEL, _REPORT_SHOWN, _SHOWN_SIDE = 6e7, 40, 50, 2048
-# Elements of the modes that a thread holds while they lie in a file.
-_MODE_ELEMENTS_PER_THREAD = 1 << 23
-# Side of a tile below which one thread is used, and the step in which sides are tried, pixels.
+# Elements of the modes that a thread holds while they lie in a file: twice the PART that is read of them at once.
+_MODE_ELEMENTS_PER_THREAD = 2 * PART
+# Side of a tile below which one thread is used, and the step in which sides are tried, pixels; both chosen.
 _ONE_THREAD_BELOW, _SIDE_STEP = 640, 32
-# The size of the tiles changes the result, so it must not depend on the number of cores.
+# The size of the tiles changes the result, so it must not depend on the number of cores; two were chosen.
 _THREADS_OF_TILES = 2
 
 

@@ -16,8 +16,10 @@ from .core.arrays import FloatArray, check_flow, check_image
 from .core.errors import DataError
 from .runtime.scratch import iter_frames
 
+# Border that is not compared, pixels, chosen.
 BORDER = 30
-# Margin that may contain values from outside after the sub-pixel shift; it is cut off.
+# Margin that may contain values from outside after the sub-pixel shift, which is less than three pixels, chosen, and
+# interpolates over two more; it is cut off.
 _GUARD = 6
 _LARGEST_SHIFT = 3.0
 # The interior must contain the window of the structural similarity, 7×7 pixels.

@@ -60,7 +60,7 @@ from .wording import (
 
 # Files of floating point are taken for those of 16 bits.
 _MOST_BITS = 16
-# A pixel that fewer frames show is about as noisy as in one of them.
+# A pixel that fewer frames show is about as noisy as in one of them; chosen.
 _FEW_FRAMES = 4
 
 

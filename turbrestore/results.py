@@ -40,11 +40,11 @@ Result = TypeVar("Result")
 
 # Error of the geometry that is seen, pixels; chosen: a line that is bent by one pixel shows a step.
 _SEEN_BEND = 1.0
-# Frames whose halves are too few to tell what they agree on.
+# Frames whose halves are too few to tell what they agree on, chosen.
 FEW = 8
-# Share of the image that is worth a look; most of something.
+# Share of the image that is worth a look, chosen; most of something.
 _UNSEEN, _HALF = 0.01, 0.5
-# Largest displacement, in standard deviations along an axis.
+# Largest displacement, in standard deviations along an axis, chosen: 0.3 % of normal ones are larger.
 _LARGEST = 3.0
 
 

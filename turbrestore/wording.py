@@ -20,11 +20,11 @@ from .runtime.scratch import iter_frames
 from .seeing.strength import LARGEST_BLUR, Estimate, Seeing
 from .verification.structure import LASTING, LEFT, StructureReading
 
-# A frame counts if its weight is at least this share of the average weight.
+# A frame counts if its weight is at least this share of the average weight, chosen.
 _COUNTS = 0.2
-# Share of saturated pixels above which they are reported.
+# Share of saturated pixels above which they are reported, chosen.
 _REPORTED_SHARE = 0.01
-# Motion beyond this share of the shorter side is too large for optical flow in some places.
+# Motion beyond this share of the shorter side is too large for optical flow in some places; chosen.
 _LARGE_MOTION = 1 / 12
 
 

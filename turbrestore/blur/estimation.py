@@ -55,29 +55,31 @@ from .psf import GAUSSIAN, Float64Array, check_exponent, fused_exponent
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Factors by which the image is reduced; smallest side of a reduced image and of an image that is analysed at all.
+# Factors by which the image is reduced; smallest side of a reduced image and of one that is analysed at all.  Chosen.
 _REDUCTIONS = (1, 2, 3, 4, 6, 8)
 _SMALLEST_SIDE, _SMALLEST_IMAGE = 60, 16
-# Smallest n; share of the contrast; multiple of s_1.
+# Smallest n, about what rounding to 12 bits leaves; share of the contrast; multiple of s_1, chosen like the share: more
+# noise everywhere costs clean clips up to 0.8 dB.
 LEAST_NOISE = 1e-4
 _MISFIT, _MULTIPLES = 0.025, (1.5, 2.0)
-# Ratios of s_2 to s_1, and shares of the contrast, between which the multiple grows.
+# Ratios of s_2 to s_1, and shares of the contrast, between which the multiple grows; all chosen.
 _SMOOTH, _NOISY = (1.5, 2.0), (0.03, 0.05)
-# Smallest width that a reduced image resolves, in its own pixels.
+# Smallest width that a reduced image resolves, in its own pixels, chosen.
 _RESOLVED = 0.6
 # Evidence, in units of L, that a blur needs; and the evidence it needs if the image itself is to be preferred over its
-# reductions, or if it is no wider than ordinary photographs are soft (SOFT pixels).  Fused images without blur reach
-# 0.22 there, blurred ones begin at 0.35.
+# reductions, both chosen, or if it is no wider than ordinary photographs are soft (SOFT pixels).  Fused images without
+# blur reach 0.22 there, blurred ones begin at 0.35.
 _EVIDENCE, _STRONG_EVIDENCE, _SOFT_EVIDENCE = 0.08, 0.2, 0.23
-# Side of the part that is analysed; rows of positions at which detail is measured at a time, and how far its filters
-# reach, pixels.
+# Side of the part that is analysed, chosen; rows of positions at which detail is measured at a time, and how far its
+# filters reach, 4 and 1 pixels.
 PART, _STRIP_ROWS, _REACH = 128, 256, 5
 # 125 is a power of five: transforms of this size take almost twice as long as those of 120×120 or of 128×128 pixels.
 _SLOW_SIZE = 125
 # Factor on the relative uncertainty of the image itself if its evidence is strong; exponent of the preference for
-# stronger reduction.
+# stronger reduction; both chosen.
 _PREFERENCE, _LARGER_REDUCTION = 0.8, 0.15
 # Share of the uncertainty that is subtracted from widths up to the first of these; none from the second on, pixels.
+# Chosen; benchmarks/decisions/blur.md has fixed shares of the width.
 _CAUTION, _NARROW, _WIDE = 0.5, 2.0, 3.0
 
 

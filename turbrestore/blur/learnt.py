@@ -46,19 +46,19 @@ from .witnesses.image_evidence import ImageEvidence
 from .witnesses.spectral_variation import RINGS, SIDE, SpectralVariation, window_power, window_weights
 from .witnesses.two_tones import GRID, TwoTones
 
-# Grid of G: widths relative to that of the posterior, the first of which is no blur.
+# Grid of G: widths relative to that of the posterior, the first of which is no blur; chosen.
 FACTORS: Float64Array = np.array([0, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.15, 1.35, 1.6, 2.0, 2.6])
-# Rings whose values are read.
+# Rings whose values are read, chosen.
 _PICKED = np.array([1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 17, 20, 24, 28])
-# Costs of a gradient above this are all the same, and so many gradients make a unit.
+# Costs of a gradient above this are all the same, and so many gradients make a unit (κ_m); both chosen.
 _DEAREST, GRADIENTS = 20.0, 40.0
-# Decibels by which a wider blur may gain less, and number of factors that are tried.
+# Decibels by which a wider blur may gain less (benchmarks/decisions/blur.md), and number of factors that are tried.
 _ALIKE, _TRIED = 0.2, 200
-# Least and largest logarithm of the deviation that a network is trained to say.
+# Least and largest logarithm of the deviation that a network is trained to say: 5 % and a factor of e; chosen.
 LOG_SPREADS = (-3.0, 1.0)
-# Standardised values beyond this were hardly seen in training.
+# Standardised values beyond this were hardly seen in training; chosen.
 FARTHEST = 4.0
-# Reductions at which gradients are read; the shortest side that they leave has as many pixels as the largest.
+# Reductions at which gradients are read, octaves; the shortest side that they leave has as many pixels as the largest.
 _SCALES = (1, 2, 4, 8)
 
 

@@ -16,11 +16,12 @@ from ..core.robust import robust_scale
 from .psf import Float64Array
 
 # Width of the border whose median is the background, in shares of the side; deviations of the noise above which light
-# is that of the point, and least ratio of peak and noise.
+# is that of the point, and least ratio of peak and noise; all chosen.
 _BORDER, _SEEN, _CLEAR = 0.1, 3.0, 20.0
-# Share of the light that may lie beyond the border, share of the peak that a second point may have, and radius of the
-# largest PSF, pixels.
+# Share of the light that may lie beyond the border, share of the peak that a second point may have, both chosen, and
+# radius of the largest PSF, pixels: four times the widest blur that is found.
 _LOST, _SECOND, _LARGEST = 0.02, 0.2, 84
+# Least side of an image: a border of one pixel leaves 3×3 pixels.
 _LEAST_SIDE = 5
 
 

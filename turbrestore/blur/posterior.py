@@ -53,22 +53,26 @@ from .witnesses.short_exposure import TILT_SPREAD
 from .witnesses.spectral_variation import RINGS, SpectralVariation, measure_variation
 from .witnesses.two_tones import two_tones
 
-# How much less likely the narrowest lens is, as a logarithm, where frames have been moved and hence interpolated.
+# How much less likely the narrowest lens is, as a logarithm, where frames were moved and hence interpolated; chosen.
 _INTERPOLATED = 3.0
-# Widest blur of frames that are not reduced, pixels, and the factors of the others.
+# Widest blur of frames that are not reduced, pixels, chosen, and the factors of the others: octaves, up to which the
+# widest lens of the hypotheses is resolved.
 _WIDEST, _REDUCTIONS = 3.0, (2, 4)
-# Widths that are reported.
+# Widths that are reported: median and a standard deviation.
 _QUANTILES = (0.16, 0.5, 0.84)
 # Range of ln V of air that does not blur, V below which a scene counts as static, and the least V, squared pixels.
+# These and all below were set on simulated clips.
 _RANGE_OF_V, _STILL, _LEAST_V = 7.0, 0.03, 1e-3
 # g and τ: values, and mean and standard deviation of the logarithm.
 _SHARES, SHARE_PRIOR = np.exp([-2.2, -1.6, -1.1, -0.7, -0.3]), (-1.1, 0.5)
 _SHIFTS, SHIFT_PRIOR = np.array([0.04, 0.1, 0.2, 0.3, 0.45]), (float(np.log(0.12)), 0.7)
-# Factors of the stretch and of the shift in s and in s_4; errors of s and s_4 by that of the noise, in units of
-# noise over signal; model error, relative and absolute; weight of a ring, as neighbouring rings are not independent.
+# Factors of the stretch and of the shift in s, where j is exact, and in s_4; errors of s and s_4 by that of the noise,
+# in units of noise over signal; model error, relative and absolute; weight of a ring, as neighbouring rings are not
+# independent.
 _STRETCH, _SHIFT, _NOISE_ERROR = (0.8, 1.36), (1.0, 0.25), (0.15, 0.3)
 _MODEL_ERROR, _LEAST_ERROR, _RING_WEIGHT = 0.3, 1e-3, 0.35
-# Rings that count, as long as the signal exceeds the noise by this factor.
+# Rings that count, from the first to which the window does not spread the mean, as long as the signal exceeds the noise
+# by this factor.
 _FIRST_RING, _LAST_RING, _CLEAR = 2, 25, 2.0
 # Softness of scenes, pixels, with weights; κ_m is :data:`turbrestore.blur.learnt.GRADIENTS`.
 _SOFTNESS = ((0.25, 0.36), (0.5, 0.35), (0.8, 0.2), (1.15, 0.07), (1.6, 0.02))

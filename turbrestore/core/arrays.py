@@ -30,7 +30,7 @@ Frame = TypeVar("Frame")
 CHANNELS = (3,)
 # Rounding error of float32 at full scale: intensities that differ by less are the same.
 ROUNDING = float(np.finfo(np.float32).eps)
-# Numbers in each part of a large array that is processed in parts.
+# Numbers in each part of a large array that is processed in parts: 16 MiB of float32.
 PART = 1 << 22
 # Weights of RGB by Rec. 601, as OpenCV and most cameras use them.
 _LUMA = np.array([0.299, 0.587, 0.114], dtype=np.float32)

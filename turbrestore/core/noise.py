@@ -13,12 +13,12 @@ from .arrays import ROUNDING, FloatArray, check_grey
 # Rows that are filtered at once, and pixels that tell the noise to a quarter of a percent.
 _NOISE_ROWS, _NOISE_PIXELS = 16, 1 << 18
 # Levels at which a curve of the noise is known at most, fewest pixels for one of them, and share of these pixels, the
-# flattest, in each of two groups.
+# flattest, in each of two groups; all chosen.
 _LEVELS, _PIXELS, _FLATTEST = 12, 200, 0.2
 # Noise is that of photons if the curve has so many levels, a line leaves no more than this share of what it varies by,
-# and it is so many times larger where it is bright.
+# and it is so many times larger where it is bright; all chosen.
 _FEWEST_LEVELS, _STRAIGHT, _PHOTONS = 5, 0.5, 4.0
-# Share of the steepest slope of a sum of squares below which a slope is rounding.
+# Share of the steepest slope of a sum of squares below which a slope is rounding: some thousand times that of float64.
 _LEAST_GRADIENT = 1e-12
 
 

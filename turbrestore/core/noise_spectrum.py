@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from .arrays import FloatArray
 
-# Side of a window, pixels, and most windows along an axis, which bounds the time for large images.
+# Side of a window, pixels, and most windows along an axis, which bounds the time for large images; both chosen.
 SIDE, _MOST_WINDOWS = 32, 16
 # Centres of the rings, cycles per pixel.  The last one holds the corners too.
 RINGS: NDArray[np.float64] = np.arange(SIDE // 2 + 1) / SIDE

@@ -9,7 +9,7 @@ from ..blur.posterior import BlurPosterior
 from ..core.decision import Decision
 from .guards import GuardParams, GuardReading
 
-# Probability from which the air is said to have blurred the image.
+# Probability from which the air is said to have blurred the image, chosen.
 _MOSTLY = 0.8
 
 

@@ -36,13 +36,13 @@ from .guards import BACK_OFF, GuardParams, GuardReading, evaluate_guards
 _BYTES, _CHANNEL_BYTES = 22, 2
 # Bytes per pixel and channel of the results of two attempts.
 _RESULTS_BYTES = 8
-# The widest blur that is found, pixels, chosen: a wider one leaves nothing to restore.
+# The widest blur that is found, pixels: the widest that is tried in an image reduced by 8, rounded up.
 WIDEST = 21.0
-# Most attempts; if the last one fails, no blur is removed.
+# Most attempts, chosen; if the last one fails, no blur is removed.
 _MOST_TRIES = 10
 # Shortest side that tiles may have, pixels.
 SMALLEST_SIDE = 4 * HALO
-# More threads than these take no more memory.
+# More threads than these, of three channels and the guide, take no more memory.
 MOST_THREADS = 4
 
 # What the image alone tells, and what the image and the frames tell; None where it is not asked.

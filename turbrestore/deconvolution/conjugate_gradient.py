@@ -27,10 +27,12 @@ from ..runtime.fourier import irfft2, rfft2
 from ..runtime.image_stacks import Stack, load, namespace, store
 from .problem import MARGIN_SIGMAS, Problem, margin_around, total
 
-# A residual below this share of the energy of the data consists of rounding errors.
+# A residual below this share of the energy of the data, about the square of float32's precision, is rounding.
 ROUNDING = 1e-14
-# Iterations for the Wiener solution that nltv and tv start from; further ones change it only near the border.
+# Iterations for the Wiener solution that nltv and tv start from; further ones change it only near the border.  Chosen.
 _START_STEPS = 40
+# Contrast over noise in the fidelity of Wiener deconvolution; see wiener_fidelity.
+FIDELITY = 6.0
 
 
 class GradientState(NamedTuple):
@@ -118,7 +120,7 @@ def wiener_fidelity(image: FloatArray, noise: float) -> float:
     """
     # Unlike NumPy's, OpenCV's keeps no copy of the image in double precision.
     _, deviation = cv2.meanStdDev(image.reshape(-1, 1))
-    return max(6.0 * float(deviation.item()) / float(np.hypot(noise, 0.002)), 1.0)
+    return max(FIDELITY * float(deviation.item()) / float(np.hypot(noise, 0.002)), 1.0)
 
 
 def wiener_image(problem: Problem, noise: float) -> Stack:

@@ -18,9 +18,9 @@ import numpy as np
 from .deconvolve import DeconvolutionParams
 from .problem import MARGIN_SIGMAS, margin_around
 
-# Of any size: compiled code, tiles of the search, stacks of threads.
+# Of any size, measured as well: compiled code, tiles of the search, stacks of threads.
 _FIXED = 2e7
-# Width of the blur that the margin is computed for where none is given, pixels.
+# Width of the blur that the margin is computed for where none is given, pixels, chosen.
 _SIGMA = 3.0
 # Pairs for each neighbour that a pixel chooses.
 _PAIRS = 0.55

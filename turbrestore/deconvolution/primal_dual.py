@@ -48,16 +48,16 @@ import numpy as np
 from ..runtime.image_stacks import Stack
 from .problem import Problem
 
-# Over-relaxation ρ.
+# Over-relaxation ρ, chosen below the 2 at which the iteration need not converge.
 RELAXATION = 1.8
-# τ‖K‖.  Small primal steps suit images in [0, 1] with λ between 300 and 30000.
+# τ‖K‖.  Small primal steps suit images in [0, 1] with λ between 300 and 30000.  Chosen.
 PRIMAL_STEP = 0.08
-# Smallest t/λ up to an iteration, and from then on.
+# Smallest t/λ up to an iteration, and from then on: see "Step sizes".
 EARLY_DATA_STEP, EARLY, LEAST_DATA_STEP = 0.2, 50, 0.02
 # Number of iterations over which a change of the image is measured.  Oscillations mostly cancel within that many
-# iterations; a drift does not.
+# iterations; a drift does not.  Chosen.
 WINDOW = 10
-# An image is at rest if it has not changed over this many windows.
+# An image is at rest if it has not changed over this many windows, chosen.
 REST = 5
 
 

@@ -36,10 +36,10 @@ from ..core.noise import NoiseCurve
 from ..runtime.fourier import fast_length, irfft2, rfft2
 from ..runtime.image_stacks import Stack, load, namespace
 
-# Smallest margin, in widths of the blur, and least shorter side of an image; the second chosen: a wider blur leaves
-# nothing to restore.
+# Smallest margin, beyond which lie 6·10⁻⁵ of a Gaussian along an axis, and least shorter side of an image, in widths of
+# the blur; the second chosen: a wider blur leaves nothing to restore.
 MARGIN_SIGMAS, _SIGMAS_A_SIDE = 4.0, 8
-# Largest weight of a pixel, and the inverse of the least.
+# Largest weight of a pixel, and the inverse of the least; chosen.
 _MOST_WEIGHT = 4.0
 # Transforms of smaller images are faster on one thread than on several.
 PARALLEL_PIXELS = 1 << 20

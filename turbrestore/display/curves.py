@@ -16,7 +16,7 @@ from .figure import ACCENT, FONT, INK, WIDTH, add_axes, new_figure, use_integer_
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Largest number of points along a curve over the frames.
+# Largest number of points along a curve over the frames, chosen.
 _POINTS = 600
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 # Colours of text and axes, of the data that is shown, and of the data it is compared with.
 INK, ACCENT, REST = "#747c87", "#1786a6", "#a3abb5"
-# Size of a single plot, inches; font size, points.
+# Size of a single plot, inches; font size, points; all chosen.
 WIDTH, HEIGHT = 4.6, 2.9
 FONT = 8.5
 

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Longest side of a map, pixels, and number of arrows along it.
+# Longest side of a map, pixels, and number of arrows along it; both chosen.
 _MAP_SIDE, _ARROWS = 320, 20
-# Opacity of the image under a map.
+# Opacity of the image under a map, chosen.
 _UNDERLAY = 0.35
-# Colours and arrows are scaled to this quantile, so that a few folds of the flow do not set the scale.
+# Colours and arrows are scaled to this quantile, so that a few folds of the flow do not set the scale; chosen.
 _SCALE_QUANTILE = 0.99
 
 

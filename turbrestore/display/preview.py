@@ -16,7 +16,7 @@ from ..core.errors import DataError
 
 # OpenCV writes lossless WebP where the quality is above 100.
 _LOSSLESS = 101
-# Longest side of the image on a card, pixels.
+# Longest side of the image on a card, pixels, chosen.
 _THUMBNAIL = 224
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Singular values below this share of the largest are rounding errors.
+# Singular values below this share of the largest are rounding errors; chosen.
 _ROUNDING = 1e-5
 
 

@@ -21,9 +21,9 @@ from ..runtime.scratch import iter_frames
 from .dynamic_texture import DynamicsParams, identify
 from .flow_model import Float64Array, FlowDynamics, project_deviation
 
-# Share of the flows, the last ones, that no model is trained on.
+# Share of the flows, the last ones, that no model is trained on, chosen.
 _HELD_OUT = 0.25
-# Training lengths and numbers of states, as shares of the largest.
+# Training lengths and numbers of states that are compared, as shares of the largest, chosen.
 _LENGTHS, _RANKS = (1 / 8, 1 / 4, 1 / 2, 3 / 4, 1.0), (1 / 8, 1 / 4, 1 / 2, 1.0)
 
 

@@ -42,16 +42,18 @@ from .frame_noise import (
 
 # Smallest variance, so that noise-free synthetic data keep every gain defined: (1/4096 of full scale)².
 _IMAGE_NOISE_FLOOR = 6e-8
-# Sharpness that differs by less than this share does not justify averaging fewer frames.
+# Sharpness that differs by less than this share, chosen, does not justify averaging fewer frames.
 _LEAST_SPREAD = 0.03
-# Share of the mean variance by which every pixel varies at least.
+# Share of the mean variance by which every pixel varies at least, chosen.
 _LEAST_DEVIATION = 0.1
-# How many times the variance exceeds its robust estimate where an object has moved.
+# How many times the variance exceeds its robust estimate where an object has moved, chosen.
 _HEAVY_TAIL = 4.0
 # Variance of a Sobel derivative (divided by 8) of white noise of unit variance, and the pixels over which such
-# derivatives correlate.
+# derivatives correlate: the sum of their squared correlations, 2.9.
 _SOBEL_NOISE, _SOBEL_AREA = 12 / 64, 3.0
-# κ of pure noise, and the least share of noise for which a window without its middle is better.
+# κ of pure noise: a Gaussian window g_{s/2} is four times as high in the middle as g_s, so that the window
+# (g_s − κ g_{s/2}) / (1 − κ) is zero there, and the noise of a pixel does not count.  Least share of noise for which a
+# window without its middle is better: clean clips, which have less, lose 0.2 dB by it.
 _MIDDLE, _LEAST_SHARE = 0.25, 0.15
 # Rings of the highest frequencies, chosen: where scenes have little, and noise is told best.
 _HIGHEST = 4

@@ -44,29 +44,30 @@ from .correction import Correction
 from .placement import Placement, camera_moves, reduce_frames, relative_window
 from .survey import FEWEST, Survey
 
-# d counts from the first times the sum of v and the square of the second; windows of d and of v, pixels.
+# d counts from the first times the sum of v and the square of the second; windows of d and of v, pixels; all chosen.
 _EXCEEDS, _LEAST_DEVIATION = 8.0, 0.01
 _WINDOW, _VARIANCE_WINDOW = 1.5, 3.0
-# Least r, and r in standard deviations of the displacement; the scene nearby, for e, ends a pixel before r.
+# Least r, chosen, and r in standard deviations of the displacement, within which 99.7 % of normal numbers are; the
+# scene nearby, for e, ends a pixel before r.
 _REACH, _REACHED = 4, 3.0
-# Radii of the gaps that are closed, of the discs that must fit, and of the surroundings that are replaced too, pixels.
+# Radii of closed gaps, of the discs that must fit, and of the surroundings that are replaced too, pixels; all chosen.
 _GAP, _DISC, _AROUND = 2, 7, 3
-# Standard deviation of the transition between frame and background, pixels.
+# Standard deviation of the transition between frame and background, pixels, chosen.
 _FADE = 1.5
 # The same for small objects: e² counts from the first times the sum of a quarter of v, for e is measured in a window,
 # and the square of the least deviation, and beside such pixels from the third times that; windows of e and of v, and
-# the transition, pixels.
+# the transition, pixels; all chosen.
 _SMALL_EXCEEDS, _SMALL_SHARE, _SLIGHTLY = 9.0, 0.25, 0.2
 _SMALL_WINDOW, _SMALL_VARIANCE_WINDOW, _SMALL_FADE = 0.8, 1.5, 0.7
 # Least share of the frames that small objects cover (strong turbulence over fine detail reaches two thirds of it), and
-# least share of them that is brighter than the scene nearby, or darker.
+# least share of them that is brighter than the scene nearby, or darker, chosen.
 _LEAST_SMALL, _ONE_SIDED = 0.06, 0.75
 # Least and largest share of the frames that objects cover, largest part of a frame that is replaced, and fewest frames
-# that show a pixel of the background.
+# that show a pixel of the background; all chosen.
 _LEAST, _LARGEST, _LARGEST_PART, _SEEN = 0.0025, 0.35, 0.5, 3
-# Least share of all edges that the background has.
+# Least share of all edges that the background has, chosen.
 _OWN_EDGES = 0.5
-# Most pixels of what a moving camera shows, in frames, and the share of the variance that following it may leave.
+# Most pixels of what a moving camera shows, in frames, and share of the variance that following may leave; both chosen.
 _LARGEST_SCENE, _FOLLOWED = 4.0, 0.5
 
 

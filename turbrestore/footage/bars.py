@@ -22,9 +22,9 @@ from .placement import relative_window
 from .survey import Survey
 
 # Largest intensity of a bar, and largest range of it in place and time; least step to the picture beside it, intensity,
-# and least share of the length of the bar that has it.
+# and least share of the length of the bar that has it; all chosen.
 _DARK, _EVEN, _STEP, _SHARE = 0.12, 3.5 / 255, 0.02, 0.5
-# Narrowest bar, pixels, and least part of the frame that the picture takes.
+# Narrowest bar, pixels, and least part of the frame that the picture takes; both chosen.
 _NARROWEST, _LEAST_PICTURE = 2, 0.25
 
 

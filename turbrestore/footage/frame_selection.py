@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..core.arrays import FloatArray, check_grey
 from ..core.errors import ConfigurationError, DataError, require
 
-# Small enough for the detail that turbulence blurs, large enough to suppress pixel noise.
+# Small enough for the detail that turbulence blurs, large enough to suppress pixel noise; chosen.
 _SIGMA = 1.5
-# A frame that is darker on average counts as this bright: what it shows is noise.
+# A frame that is darker on average counts as this bright, a quarter of a level of 8 bits: what it shows is noise.
 DARK = 1e-3
 
 

@@ -19,11 +19,11 @@ from ..io.pixels import PixelArray, to_unit
 from ..io.source import FrameSource, numbers_text
 from .checks.missing_pixels import fill_holes
 
-# The object is what is brighter than this share of the way from the field to its own brightness, after smoothing.
+# The object exceeds this share of the way from the field to its own brightness, after smoothing, pixels; both chosen.
 _SHARE, _SMOOTHING = 0.15, 2.0
-# Room around the object, as a share of its size and at least, pixels.
+# Room around the object, as a share of its size and at least, pixels; both chosen.
 _MARGIN, _LEAST_MARGIN = 0.2, 16
-# An object exceeds the noise of the field by so many standard deviations, and by two levels of 8 bits.
+# An object exceeds the noise of the field by so many standard deviations, and by two levels of 8 bits; both chosen.
 _LEAST_CONTRAST, _LEAST_LEVELS = 8.0, 2 / 255
 # Cards that say where in the sky a pixel of a FITS image lies.
 _SKY = ("CRPIX", "CRVAL", "CTYPE", "CDELT", "CUNIT", "CROTA", "CD1_", "CD2_", "PC1_", "PC2_")

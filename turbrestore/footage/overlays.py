@@ -54,33 +54,37 @@ from .correction import Correction
 from .placement import Placement, camera_moves, relative_window
 from .survey import Moments, Survey
 
-# Fewest frames of a clip in which an overlay is looked for.
+# Fewest frames of a clip in which an overlay is looked for: a test finds one in three, and none in two.
 FEWEST = 3
 # An edge is static if it varies by less than its gradient times this share of the motion of the edges, or one pixel;
-# with a static camera, the edges move by at least so many pixels.
+# with a static camera, the edges move by at least so many pixels.  Tests fail at half and at double of either.
 _STATIC, _LEAST_BENDING = 1 / 3, 0.3
 # The least change that counts is one level of 8 bits, or less in a clip whose range, between these percentiles, is
-# below this share of full scale.
+# below this share of full scale; both chosen.
 _SPAN, _RANGE = 0.5, (1, 99)
-# Largest deviation of pixels without noise, in units of the noise, and level of a dark stop, from black to the scene.
+# Largest deviation of pixels without noise, in units of the noise, and level of a dark stop, from black to the scene;
+# both chosen.
 _CONSTANT, _DARK = 0.5, 0.25
-# Fewest static edge pixels of an overlay, as a share of the frame, and the largest part of a frame that it may cover.
+# Fewest static edge pixels of an overlay, as a share of the frame, chosen, and the largest part of a frame that it may
+# cover: that of a stop around half of the frame, and not of one around nearly all.
 _LEAST_EDGES, _LARGEST = 0.0005, 0.7
-# Least share of the scene, shown by no frame, that the decision states.
+# Least share of the scene, shown by no frame, that the decision states, chosen.
 _REPORTED = 0.002
 # Pixels around an overlay that are replaced too, reach of the fill under which shifts are measured, and the share of a
-# reduced pixel beside an overlay that has to show the scene.
+# reduced pixel beside an overlay that has to show the scene; all chosen.
 _AROUND, _REACH, _FREE = 2, 12.0, 0.9
 # With a static camera: radius around static edges in which what has no noise belongs to them; pixels around them over
-# which the overlay fades.
+# which the overlay fades; both chosen.
 _NEAR, _FADE = 4, 0.7
 # An edge is drawn over the scene if its deviation is below that of the noise by this factor, or its motion below that
-# of the edges of the scene by this one.
+# of the edges of the scene by this one: tests of titles fail at half and at double of either.
 _NOISELESS, _DRAWN = 0.7, 1 / 8
-# Least share of the clear edges in a title, and of the pixels next to it, that are drawn; pixels along the border that
-# do not count.
+# Least share of the clear edges in a title, and of the pixels next to it, that are drawn: tests fail at half and at
+# double; pixels along the border that do not count: codecs draw up to two lines there, and a derivative reaches one
+# more.
 _LEAST_DRAWN, _BORDER = 1 / 3, 3
-# A part of a title has moved if edges with this share of its squared gradients are so many pixels from where they were.
+# A part of a title has moved if edges with this share of its squared gradients are so many pixels from where they were,
+# chosen: a test moves a third and two thirds of them, by less and by more.
 _MOVED, _MOTION = 0.5, 0.5
 # What is static is half-transparent if less than this share of it, without its edges, lacks noise.  On photographs of a
 # cup, a person and bricks behind words of an opacity of 0.35 or less, 0.02 or less does, with a static or a shaking

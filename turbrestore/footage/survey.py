@@ -26,10 +26,10 @@ from ..runtime.scratch import drop_pages, iter_frames, new_stack
 from ..runtime.steps import Progress, step_counter
 from .correction import Correction
 
-# Most frames that are kept whole, and fewest, which tell what stays from what moves; those beyond take at most so many
-# bytes.
+# Most frames that are kept whole, for their cost, and fewest, chosen, which tell what stays from what moves; those
+# beyond take at most so many bytes.
 _MOST, FEWEST, _WHOLE_BYTES = 48, 9, 4e8
-# About how many numbers all reduced frames are.
+# About how many numbers all reduced frames are, which take 32 MB.
 _NUMBERS = 8e6
 
 

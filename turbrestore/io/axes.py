@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from ..core.arrays import CHANNELS
 from .pixels import LEAST_SIDE
 
-# Places along each axis at which the order of the axes is judged, and how much more alike planes must be to be taken
-# for the frames: those of 40 clips were more alike than the planes of their last axis, by a factor of 1.04 or more.
+# Places along each axis at which the order of the axes is judged, chosen, and how much more alike planes must be to be
+# taken for frames: those of 40 clips were more alike than the planes of their last axis, by a factor of 1.04 or more.
 SAMPLES, _MORE_ALIKE = 48, 1.1
-# Planes of at most this share of the median contrast show nothing.
+# Planes of at most this share of the median contrast show nothing; chosen.
 _BLANK = 0.1
 
 

@@ -24,10 +24,11 @@ from .limits import Limits
 from .pixels import FLOAT_MARGIN, PixelArray, depth_of, full_scale_of
 from .source import FrameSource
 
-# Percentage of the frames at either end whose extremes do not count.
+# Percentage of the frames at either end whose extremes do not count, chosen.
 _FEW = 10
 NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
-# Unsigned numbers of four bytes and more fill their type if one of them reaches this share of it.
+# Unsigned numbers of four bytes and more fill their type if one of them reaches this share of it, and
+# hence uses its highest byte.
 _FILLED = 1 / 256
 
 

@@ -19,7 +19,7 @@ from ..core.errors import ConfigurationError, DataError, OutputError, StorageErr
 from ..core.extras import missing_package
 
 IMAGE_OUTPUT_SUFFIXES = (".png", ".tif", ".tiff", ".fits")
-# Bytes that must stay free beside the file.
+# Bytes that must stay free beside the file, chosen.
 _SPARE = 1 << 20
 
 

@@ -26,7 +26,7 @@ PixelArray = NDArray[Any]
 MAX_PIXELS = 2**26
 # Least side of a frame whose pixels tell what they are, as that of the smallest frames that are restored.
 LEAST_SIDE = 16
-# Rounding and resampling overshoot a little; values further outside indicate another scale.
+# Rounding and resampling overshoot a little; values further outside indicate another scale; chosen.
 FLOAT_MARGIN = 0.01
 # Patterns of a Bayer sensor, by the colours of its first pixels.
 BAYER_CODES = {
@@ -38,7 +38,7 @@ BAYER_CODES = {
 BAYER_REMARK = Doubt("pixels alternate as in a Bayer mosaic: --bayer rggb (or grbg, gbrg, bggr) gives colours")
 # Number of the tag of EXIF and TIFF that :func:`upright` takes.
 ORIENTATION_TAG = 274
-# In a mosaic neighbours differ by this factor more than the next pixels of their colour; in an image they differ less.
+# Neighbours in a mosaic differ by this factor, chosen, more than the next pixels of their colour; in an image, less.
 _ALTERNATING = 1.3
 
 
@@ -152,7 +152,7 @@ def _demosaic_wide(pixels: PixelArray, pattern: str) -> PixelArray:
 def looks_like_bayer(pixels: PixelArray) -> bool:
     """Whether pixels alternate along rows and columns, as the colours of a mosaic do."""
     values = pixels.astype(np.float32)
-    if values.ndim != 2 or min(values.shape) < 16:
+    if values.ndim != 2 or min(values.shape) < LEAST_SIDE:
         return False
     for turned in (values, values.T):
         next_one = float(np.abs(turned[:, 1:] - turned[:, :-1]).mean())

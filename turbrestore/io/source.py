@@ -30,7 +30,7 @@ Roi = tuple[int, int, int, int]
 Window = tuple[slice, slice]
 # Selection that the constructor resolves to all frames, or to all rows and columns; None, but typed as either.
 _ALL: Any = None
-# Number of frames that a message lists before it only counts the others.
+# Number of frames that a message lists before it only counts the others, chosen.
 _NAMED = 5
 
 

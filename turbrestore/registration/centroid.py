@@ -44,11 +44,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MODES = ("fused", "single")
-# If the mean flow keeps this share of its length from one iteration to the next, it is the bias of the flow method.
+# If the mean flow keeps this share of its length, chosen, from one iteration to the next, it is the method's bias.  If
+# it grows by more than the reciprocal, registration has failed.
 _STALLED = 0.8
-# If it grows by more than this factor, registration has failed.
-_DIVERGED = 1.25
-# Weight of a sample of the repeated border, where a sample inside the frame has 1.
+# Weight of a sample of the repeated border, where a sample inside the frame has 1.  It counts only where no frame shows
+# a pixel, so any small weight does.
 _UNSEEN = 1e-3
 # Root mean square of one component of the displacement above which flows are searched for anew: a quarter of the side
 # of a matched patch, pixels, and half the distance over which the detail of the image changes by its deviation.  Within
@@ -57,9 +57,9 @@ _FAR, _FAR_OF_DETAIL = 2.0, 0.5
 # Share of the variance of the frames, without the motion of whole frames, that flows leave at most where displacement
 # makes it: on water whose waves shine they leave more than half, in turbulence less than a third.
 _LEFT = 0.4
-# New flows that leave more than this share of the misfit of the frames are the last ones.
+# New flows that leave more than this share of the misfit of the frames are the last ones; chosen.
 _EXHAUSTED = 0.97
-# Deviation of the window in which two flows of a frame are compared, pixels.
+# Deviation of the window in which two flows of a frame are compared, pixels, chosen.
 _COMPARED = 4.0
 
 
@@ -231,7 +231,7 @@ def centroid_steps(
         change = sizes[-1] / max(sizes[-2], ROUNDING) if len(sizes) > 1 else 0.0
         # The temporal mean is a blurred reference, so flow is measured from the first registered mean in any case.
         settled = not far and (len(sizes) > 1 or not fused or params.iterations == 1)
-        converged = settled and (sizes[-1] <= params.tolerance or _STALLED < change <= _DIVERGED)
+        converged = settled and (sizes[-1] <= params.tolerance or _STALLED < change <= 1 / _STALLED)
         if not converged:
             recentre = invert_flow(mean_flow)  # V
             total = total if fused else compose_flows(total, recentre)
@@ -245,7 +245,7 @@ def centroid_steps(
             misfits.append(_mean_misfit(image, stack, flows, runtime.threads))
             far = misfits[0] < _LEFT * _misfit_of_shifts(stack, flows, runtime)
             converged = converged and not far
-        if converged or (change > _DIVERGED and not far) or last:
+        if converged or (change > 1 / _STALLED and not far) or last:
             return Centroid(image, flows, np.array(sizes), converged)
 
 

@@ -47,14 +47,16 @@ from .flow_methods.opencv_flow import DisParams, FarnebackParams, FlowSolver, Gr
 from .flow_methods.refinement_step import RefineFlow, flow_refinement, half_grid
 from .flow_methods.tvl1 import TvL1Params, tvl1_solver
 
+# Smallest side of an image, pixels: at half the resolution, that of one matched patch.
 MIN_SIDE = 16
 # Grey levels for each local standard deviation: ±4 deviations fit into 8 bits.
 _LEVELS_PER_DEVIATION = 32.0
-# Pixels of the grid, at least, on which averages of local contrast are computed, for each deviation of their window.
+# Pixels of the grid, at least, on which averages of local contrast are computed, per deviation of the window; chosen.
 _PIXELS_A_DEVIATION = 3
-# Most batches that are prepared for a device side by side.
+# Most batches that are prepared for a device side by side, chosen.
 _BATCHES = 8
-# Share of the gradients of a frame above which noise makes it one that is smoothed, by so many pixels.
+# Share of the gradients of a frame above which noise makes it one that is smoothed: at a noise of 0.05 a chart, which
+# does not gain, is below, and a photograph above.  By so many pixels: wider smoothing gains nothing.
 _NOISY, _SMOOTHING = 0.08, 1.0
 
 

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Inches: room for labels on the left and below, margins and gaps elsewhere, height of figures with curves, room above a
-# row that has a title, and on the right of a map for its colour bar.
+# row that has a title, and on the right of a map for its colour bar; all chosen.
 _LEFT, _BOTTOM, _MARGIN, _HEIGHT, _TITLED, _MAP_RIGHT = 0.68, 0.46, 0.1, 3.2, 0.3, 0.6
 
 

@@ -13,7 +13,7 @@ from ..io.output import atomic_write
 from .comparison import environment
 from .page import page_code
 
-# Longest side of a picture, pixels, and its quality as WebP.
+# Longest side of a picture, pixels, and its quality as WebP; both chosen.
 _LONGEST, _QUALITY = 320, 90
 
 

@@ -22,14 +22,15 @@ from ..runtime.scratch import iter_frames, iter_parts
 _LOSSLESS_BYTES = 1_050_000
 # Quality of the images where they would take more.
 _QUALITY = 95
-# Longest side of an image, pixels.
+# Longest side of an image, pixels, chosen.
 _LONGEST = 2048
 # An image is shown over its own range where it spans less than the first share of full scale, or where nothing in it is
 # brighter than the second; the percentage of pixels at either end that may be clipped, and the margin beyond them, as a
-# share of the span.
+# share of the span; all chosen.
 _NARROW, _DARK, _CLIPPED, _MARGIN = 0.2, 0.5, 0.2, 0.1
 # What the switch of the page does: it clips this percentage of the pixels at either end. Where the median of what is
 # not black is dim, as in a night scene with lamps, shadows are lifted until it is brighter, by at least this exponent.
+# All chosen.
 _STRETCHED, _BLACK, _DIM, _BRIGHTER, _LEAST_EXPONENT = 0.5, 0.05, 0.15, 0.3, 0.45
 _TITLES = {"frame": "Frame", "mean": "Mean", "centroid": "Centroid", "filtered": "Filtered", "result": "Result"}
 

@@ -34,10 +34,11 @@ from .film import film_length, write_film
 from .page import check_report, page_code
 from .panels import Panel, make_panel
 
-# Quality of the film as a rate factor of H.264.
+# Quality of the film as a rate factor of H.264, and its frames per second where those of the input are unknown; both
+# chosen.
 _RATE_FACTOR = 22
 _USUAL_RATE = 25.0
-# Share of the image from which it is worth saying that the long average drifted.
+# Share of the image from which it is worth saying that the long average drifted, chosen.
 _ASTRAY = 0.02
 
 

@@ -21,7 +21,7 @@ from ..display.preview import data_uri
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Quality of the maps inside figures; they are looked at, not compared.
+# Quality of the maps inside figures; they are looked at, not compared; chosen.
 _MAP_QUALITY = 85
 _DROPPED = {"metadata", "style"}
 # Matplotlib's font declaration; the page sets the font, only the size is kept.

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 _MOST = 1e9
 _INFINITE = math.inf
 _SMALLEST = {"n": 0, "k": 0, "τ": 2}
-# Rounding that a covariance may show, relative to its largest eigenvalue.
+# Rounding that a covariance may show, relative to its largest eigenvalue, chosen.
 _ROUNDING = 1e-6
 
 

@@ -50,7 +50,7 @@ KINDS: dict[str, type[DataclassInstance]] = {
     "deconvolution": Deconvolution,
 }
 _HEADER = "header"
-# Frames are never stretched as much.
+# Frames are never stretched as much; chosen.
 _MOST_GAIN = 1e30
 
 Result = TypeVar("Result", bound="DataclassInstance")

@@ -7,8 +7,8 @@ import ctypes
 import platform
 from collections.abc import Iterator
 
-# M_MMAP_THRESHOLD of mallopt, and sizes from which arrays are mapped one by one: while memory is scarce, and by the
-# time that glibc has adapted the threshold to large arrays; bytes.
+# M_MMAP_THRESHOLD of mallopt, and sizes from which arrays are mapped one by one: while memory is scarce, chosen, and
+# by the time that glibc has adapted the threshold to large arrays; bytes.
 _MMAP_THRESHOLD, _SCARCE, _ADAPTED = -3, 1 << 20, 32 << 20
 
 

@@ -16,7 +16,7 @@ Arguments = ParamSpec("Arguments")
 # Sums may be added up in another order, and products added without rounding; values that are not finite stay what
 # they are.
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "reassoc"}}
-# What Numba and its compiler take in memory, bytes.
+# What Numba and its compiler take in memory in a first run, as measured, bytes.
 COMPILER_BYTES = 1.4e8
 
 

@@ -26,7 +26,7 @@ from .memory_size import size_text
 Item = TypeVar("Item")
 # A private map would lose what has been written to the pages that are dropped.
 _SHARED = ("r", "r+", "w+")
-# Left free beside the file: others write to the disk as well.
+# Left free beside the file, as others write to the disk as well; bytes, chosen.
 _SPARE = 1 << 26
 
 

@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
 
-# Freeing an array of this size raises the threshold of glibc from which it maps arrays one by one; bytes.
+# Freeing an array of this size raises the threshold of glibc from which it maps arrays one by one; bytes, just below
+# the largest, 32 MiB, that it follows.
 _THRESHOLD_BYTES = 31 << 20
-# Items that one thread sums before it hands the sum over.
+# Items that one thread sums before it hands the sum over, chosen.
 _SUMMED = 4
 
 Item = TypeVar("Item")

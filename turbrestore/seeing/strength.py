@@ -42,12 +42,13 @@ from .tilt_theory import MEAN_CONE, Optics, displacement_differences, strength_o
 # Relative error of a variance besides that of finitely many frames: on synthetic clips of D/r0 1 to 6 the variance of
 # blocks is 1 to 8 % too large on photographs and 21 % on a chart, as aberrations other than tilt move a block too.
 _MODEL_ERROR = 0.12
+# The same of a variance by blur, chosen.
 _BLUR_ERROR = 0.1
-# Blur by displacement above which it is a lower bound, squared pixels.
+# Blur by displacement above which it is a lower bound, squared pixels, chosen.
 LARGEST_BLUR = 2.0
-# Largest part of an image that is compared by blur, pixels a side.
+# Largest part of an image that is compared by blur, pixels a side, for its cost.
 _COMPARED = 512
-# Share of rotation from which the displacement is not that of turbulence; without any relation of x and y it is 0.5.
+# Share of rotation from which the displacement is not that of turbulence, chosen; 0.5 is that of unrelated x and y.
 _ROTATING = 0.4
 _HALF, _E_FOLD = 0.5, float(np.exp(-1))
 _DEVIATIONS = NormalDist().inv_cdf(0.975)

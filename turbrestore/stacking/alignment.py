@@ -43,25 +43,26 @@ Matrix = NDArray[np.float64]
 # What reference and image are reduced to before they are compared.
 _Features = tuple[Callable[[FloatArray], FloatArray], Callable[[FloatArray], FloatArray]]
 
-# Longest sides of the levels on which the similarity is found, pixels.
+# Longest sides of the levels on which the similarity is found, pixels, chosen.
 _LEVELS = (64, 160, 640)
-# Least sharpness that images are compared at, and the window of their local mean and spread, pixels.
+# Least blur that images are compared at, the window of their local mean and spread, pixels, and the spread, as a share
+# of the range, below which a window is flat; all chosen.
 _LEAST_BLUR, _WINDOW, _FLOOR = 0.5, 8.0, 0.02
-# Blurs that are tried on the sharper image, pixels.
+# Blurs that are tried on the sharper image, pixels, chosen.
 _BLURS = np.arange(0.0, 3.01, 0.25)
-# Correlation below which features say nothing, and above which no other features are tried.
+# Correlation below which features say nothing, and above which no other features are tried; both chosen.
 _ALIKE, _CLEARLY = 0.2, 0.6
-# Iterations of the correlation and the change that ends them.
+# Iterations of the correlation and the change that ends them, both chosen.
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-6)
 # Deviation of the windows of contrast and brightness, pixels: at first wide, because A is only nearly right; and the
-# largest displacement of a step.
+# largest displacement of a step; all chosen.
 _LOCAL, _LARGEST = (4.0, 4.0, 2.0, 2.0, 1.5, 1.5, 1.5, 1.5), 1.0
 # Reduction of the image for the windows of d, their deviations, pixels, and the share of the usual weight below which
-# one holds little.
+# one holds little; all chosen.
 _REDUCED, _WIDE, _LITTLE = 4, (32.0, 12.0), 0.03
-# How much detail is raised, and below which size, pixels.
+# How much detail is raised, and below which size, pixels; both chosen.
 _RAISED, _FINE = np.float32(4), 1.2
-# Spread, as a share of the range of an image, below which a window is flat.
+# Spread, as a share of the range of an image, below which a window of contrast and brightness is flat, chosen.
 _FLAT = 0.003
 
 

@@ -31,13 +31,13 @@ from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import correlation
 from ..registration.warp import warp
 
-# Sidereal periods of what is seen, hours (Jupiter's system II, Saturn's system III), and flattening.
-PLANETS = {"jupiter": (9.9259, 0.0649), "saturn": (10.656, 0.0980), "mars": (24.6229, 0.0059)}
-# Brightness of the limb, as a share of that of the disc.
+# Published sidereal periods of what is seen, hours, and flattening; of system II of Jupiter, and III of Saturn.
+PLANETS = {"jupiter": (9.9280, 0.0649), "saturn": (10.656, 0.0980), "mars": (24.6229, 0.0059)}
+# Brightness of the limb, as a share of that of the disc, chosen.
 _LIMB = 0.3
-# Flattening that must be seen for its direction to say where the pole is.
+# Flattening that must be seen for its direction to say where the pole is, chosen: Mars has less, Jupiter has more.
 _FLAT = 0.02
-# Frames of each third that are compared, share of the radius within which, and the window of detail, pixels.
+# Frames of each third that are compared, share of the radius within which, window of detail, pixels; all chosen.
 _COMPARED, _WITHIN, _DETAIL = 40, 0.8, 4.0
 
 

@@ -46,13 +46,13 @@ from ..settings import RestoreParams
 from ..verification.halves import keep_agreed
 from .registered import registering_flows
 
-# Weight of the interpolated frame, where a sample in its place has 1.
+# Weight of the interpolated frame, where a sample in its place has 1, chosen.
 _FILL = 1e-3
-# Variance of the box of a pixel, squared pixels, and the width of the blur below which there is none, fine pixels.
+# Variance of the box of a pixel, squared pixels; width of the blur below which there is none, fine pixels, chosen.
 _BOX, _LEAST = 1 / 12, 0.2
-# Parts of a clip that go to one half and to the other in turns.
+# Parts of a clip that go to one half and to the other in turns, chosen.
 _PARTS = 8
-# Room around a point spread function, in widths of the blur.
+# Room around a point spread function, in widths of the blur: a Gaussian falls to 0.0003 of its height there.
 _REACH = 4.0
 
 

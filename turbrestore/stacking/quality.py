@@ -28,14 +28,15 @@ from ..core.noise import estimate_noise
 from ..footage.frame_selection import DARK, best_frames, frame_quality
 from ..results import FEW
 
+# Shares that are listed, chosen.
 SHARES = (0.1, 0.25, 0.5)
 # Error of the models of blur and registration, intensity, as in Wiener deconvolution.
 _ERROR = 0.002
-# What a share has to be worth; at least as many frames are suggested as whose halves still tell what they agree on.
+# What a share has to be worth, chosen; at least as many frames are suggested as whose halves tell what they agree on.
 _WORTHWHILE = 1.05
-# Best frames, and worst ones, that are listed.
+# Best frames, and worst ones, that are listed, chosen.
 _LISTED = 10
-# Side of the image that the filter of the quality is tried on, pixels.
+# Side of the image that the filter of the quality is tried on, pixels: any that holds the filter does.
 _SIDE = 64
 
 

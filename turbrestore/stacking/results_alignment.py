@@ -28,9 +28,9 @@ from ..runtime.runtime import DEFAULT, Runtime
 from ..runtime.threads import map_ahead
 from .alignment import Alignment, align_to
 
-# Results that the median is taken of, at most.
+# Results that the median is taken of, at most, chosen.
 _MEDIAN_OF = 31
-# Longest side of a thumbnail, and room for its number, pixels.
+# Longest side of a thumbnail, and room for its number, pixels; both chosen.
 _SIDE, _LINE = 160, 18
 
 

@@ -23,13 +23,12 @@ import numpy as np
 
 from ..blur.psf import blur_otf, laplacian_symbol
 from ..core.arrays import FloatArray
+from ..deconvolution.conjugate_gradient import FIDELITY
 from ..runtime.fourier import fast_length, irfft2, rfft2
 
-# Weight of contrast over noise as in conjugate_gradient.wiener_fidelity.
-_FIDELITY = 6.0
-# Floors of the noise, of a frame and of what is remembered.
+# Floors of the noise, of a frame and of what is remembered, both chosen.
 _LEAST_NOISE = 0.015, 0.005
-# Margin of the reflection, in widths of the blur.
+# Margin of the reflection, in widths of the blur, chosen.
 _MARGIN = 6.0
 
 
@@ -53,7 +52,7 @@ def deblur(
 
     def filtered(kind: int) -> FloatArray:
         power, otf, laplacian = _transfer(shape, sigma[kind], exponent)
-        fidelity = max(_FIDELITY * contrast / float(np.hypot(noise[kind], _LEAST_NOISE[kind])), 1.0)
+        fidelity = max(FIDELITY * contrast / float(np.hypot(noise[kind], _LEAST_NOISE[kind])), 1.0)
         return irfft2(planes * (fidelity * otf / (fidelity * power + laplacian)), shape)[inner].astype(np.float32)
 
     result = filtered(0)

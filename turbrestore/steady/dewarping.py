@@ -51,9 +51,11 @@ from .grid import enlarged, follow, grid_of, inverted, pixel_of, reduced
 from .settings import SteadyParams
 from .windows import MeasuredFlows, Window, WindowFrame, light_between, normalised_grey, relit
 
-# Patches this sparse lose nothing on phase screens; closer ones take a fifth longer.
+# Patches this sparse lose nothing on phase screens; closer ones take a fifth longer.  Three refinements lose 0.05 dB.
+# The side of the patches and the smoothness were chosen.
 _FLOW = DisParams(finest_scale=0, patch_size=8, patch_stride=4, refinements=1, smoothness=10.0)
-# Change of the light in a window, logarithm, of which half is taken out: cameras hunt by less, and lamps change more.
+# Change of the light in a window, logarithm, of which half is taken out, chosen: cameras hunt by less, and lamps change
+# more.
 _HUNTING = 0.25
 
 

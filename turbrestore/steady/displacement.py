@@ -46,24 +46,25 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray
 from .camera_path.camera import Matrix, camera_flow, camera_size
 
-# Window in which |S|² is averaged, pixels; share of the frame itself.
+# Window in which |S|² is averaged, pixels; share of the frame itself; both chosen.
 _WINDOW, _OWN_SHARE = 4.0, 0.5
-# c over the median of |S_i| while the camera is static; smallest and largest c, pixels.
+# c over the median of |S_i| while the camera is static; smallest and largest c, pixels; all chosen.  Behind strong
+# air, a largest of 4 was too little.
 _SIZES, _LEAST, _MOST = 2.5, 1.0, 8.0
 # Distance of the camera from motion at constant velocity, pixels, at which it counts as half shaking; what turbulence
-# moves whole frames by comes on top.
+# moves whole frames by comes on top.  With half or twice as much, strong air is not told from a shake in test_path.py.
 _SHAKE = 2.0
-# Path, in units of c, at which an S_i of one neighbour counts half.
+# Path, in units of c, at which an S_i of one neighbour counts half, chosen.
 _PATH = 1.5
-# Agreement of the neighbours below which a point moves; longest path of turbulence, in units of c.
+# Agreement of the neighbours below which a point moves; longest path of turbulence, in units of c; chosen.
 _AGREEMENT, _LONGEST_PATH = 0.5, 2.0
-# Window of the differences of images, pixels, and the smallest that counts, intensity.
+# Window of the differences of images, pixels, as in the fusion, and the smallest that counts, intensity; chosen.
 _IMAGE_WINDOW, _DIFFERENCE = 2.0, 0.04
-# Every so many pixels of the grid enter the median.
+# Every so many pixels of the grid enter the median, for its cost.
 _SAMPLE = 3
-# Mean of |S_i| over |S_1| at which turbulence is half likely.
+# Mean of |S_i| over |S_1| at which turbulence is half likely: most air has 1.3 to 2.5, a camera that advances 4 to 6.
 _GROWTH = 4.0
-# What turbulence moves whole frames by, in medians of |S_i|.
+# What turbulence moves whole frames by, in medians of |S_i|, chosen.
 _WHOLE = 1.4
 
 

@@ -13,7 +13,7 @@ from ..core.arrays import FloatArray
 from ..registration.flow_algebra import invert_flow
 from ..registration.warp import sample_linear
 
-# Smallest side of an image whose grid is coarser than itself.
+# Smallest side of an image whose grid is coarser than itself, chosen.
 _HALVED = 128
 
 

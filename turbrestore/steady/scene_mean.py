@@ -36,10 +36,10 @@ from .dewarping import first_guess, measure_flow
 from .grid import grid_of, reduced
 from .windows import iter_scenes
 
-# Frames of a run.
+# Frames of a run, chosen.
 _RUN = 12
-# Window in which the square of the gradient is averaged, pixels of the grid, and the gradient, intensity a pixel, at
-# which a place counts half.  Half or twice as much does as well, four times leaves out too much.
+# Window in which the square of the gradient is averaged, pixels of the grid, chosen, and gradient, intensity a pixel,
+# at which a place counts half: half or twice as much does as well, four times leaves out too much.
 _TEXTURE_WINDOW, _FLAT = 3.0, 0.004
 
 

@@ -8,7 +8,7 @@ from typing import Literal
 from ..core.errors import require, require_between
 
 CAMERAS = ("keep", "steady", "lock")
-# Frames that a live stream may lag behind.
+# Frames that a live stream may lag behind: what docs/steady.md promises, chosen.
 _LAG = 2
 
 

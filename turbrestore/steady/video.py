@@ -46,7 +46,7 @@ from .window_blur import WindowWitnesses, find_blur_of_image, find_blur_of_windo
 from .windows import Window, iter_windows, relit
 
 # Frames since the memory began when the width of its blur is estimated, and frames over which the width that is removed
-# goes there, so that no frame is suddenly sharper.
+# goes there, so that no frame is suddenly sharper; both chosen.
 _REMEMBERED, _GRADUALLY = 24, 16
 
 

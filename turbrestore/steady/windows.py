@@ -20,9 +20,9 @@ from numpy.typing import ArrayLike
 from ..core.arrays import FloatArray, check_stream, check_unit_image, luminance
 from ..core.errors import DataError
 from ..footage.checks.content import BLANK_CONTRAST, LEAST_CONTRAST
-from ..footage.checks.scene_cuts import similarity_at, thumbnail
+from ..footage.checks.scene_cuts import ALIKE, similarity_at, thumbnail
 from ..registration.camera.global_shift import ShiftReference, prepare_shift_reference
-from ..registration.flow import MIN_SIDE, normalise_to_8_bits
+from ..registration.flow import MIN_SIDE, FlowParams, normalise_to_8_bits
 from ..registration.flow_methods.opencv_flow import GreyImage
 from ..runtime.image_stacks import spline_planes
 from .camera_path.camera import Matrix
@@ -31,18 +31,14 @@ from .grid import pixel_of, reduced
 # Flows (h, w, 2) from a frame to its neighbours, and their affine parts (2, 3), by their distance in frames.
 MeasuredFlows = tuple[dict[int, FloatArray], dict[int, Matrix]]
 
-# Likeness of two successive frames below which the second starts a new scene.
-_CUT = 0.5
-# Contrast normalisation of the images that flow is measured from, as in registration.flow.
-_CONTRAST_WINDOW, _CONTRAST_FLOOR = 10.0, 0.01
-# Side of the squares in which light is compared, pixels; range of intensities that are compared, and fewest squares.
+# Side of the squares in which light is compared, pixels; range of intensities compared, and fewest squares; chosen.
 _SQUARE, _EXPOSED, _FEWEST = 8, (0.02, 0.95), 16
-# A gain that is as many times the scatter of the squares counts half.
+# A gain that is as many times the scatter of the squares counts half: half or twice as much fails in test_light.py.
 _SCATTER = 2.0
-# Smallest and largest logarithm of a gain, and how often the intensity is squared for the power by which it fades
-# towards white: NumPy's power takes four times as long.
+# Smallest and largest logarithm of a gain, chosen: half a per cent and a factor of two.  How often the intensity is
+# squared for the power by which it fades towards white, chosen: NumPy's power takes four times as long.
 _LEAST_LIGHT, _MOST_LIGHT, _WHITE_SQUARED = 0.005, 0.7, 3
-# Standard deviation of the shading that is taken off thumbnails, pixels of the thumbnail.
+# Standard deviation of the shading that is taken off thumbnails, pixels of the thumbnail, chosen.
 _SHADING = 5.0
 
 
@@ -142,12 +138,12 @@ def iter_scenes(frames: Iterable[ArrayLike]) -> Iterator[tuple[FloatArray, int, 
             contrast, detail = 0.0, np.zeros_like(detail)
         if usual and contrast <= BLANK_CONTRAST * usual:
             # Noise differs from frame to frame; what does not is a scene of little contrast.
-            alike = np.any(detail) and np.any(faint) and similarity_at(detail, faint)[0] >= _CUT
+            alike = np.any(detail) and np.any(faint) and similarity_at(detail, faint)[0] >= ALIKE
             faint = detail
             if not alike:
                 yield image, scene, True
                 continue
-        cut = number > 0 and contrast > 0 and similarity_at(detail, before)[0] < _CUT
+        cut = number > 0 and contrast > 0 and similarity_at(detail, before)[0] < ALIKE
         scene += cut
         # A scene that fades out keeps its contrast, so that noise does not become one.
         before, usual = detail, contrast if cut else max(usual, contrast)
@@ -156,7 +152,7 @@ def iter_scenes(frames: Iterable[ArrayLike]) -> Iterator[tuple[FloatArray, int, 
 
 def normalised_grey(grey: FloatArray, shape: tuple[int, ...]) -> GreyImage:
     """Normalise the local contrast of the luminance (h, w) of an image of this shape on its grid."""
-    return normalise_to_8_bits(grey, _CONTRAST_WINDOW / pixel_of(shape), _CONTRAST_FLOOR)
+    return normalise_to_8_bits(grey, FlowParams.contrast_window / pixel_of(shape), FlowParams.contrast_floor)
 
 
 def coarse_image(image: FloatArray) -> FloatArray:

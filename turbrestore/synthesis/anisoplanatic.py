@@ -53,7 +53,7 @@ from .pupil import (
 )
 from .sequence import CameraParams, SyntheticFrame, check_scene, exposed_frame, record
 
-# The reflected margin covers displacements up to this many standard deviations.
+# The reflected margin covers displacements up to this many standard deviations, chosen.
 _WIDEST_TILT = 4
 
 

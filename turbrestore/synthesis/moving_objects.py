@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from ..core.arrays import FloatArray
 from ..core.errors import require_between
 
-# Semi-axes in shares of the shorter side of the scene, and speeds, pixels a frame.
+# Semi-axes in shares of the shorter side of the scene, and speeds, pixels a frame; all chosen.
 _SIZES, _SPEEDS = (0.06, 0.12), (1.0, 3.0)
-# Period of the stripes in semi-axes, and their amplitude, intensity.
+# Period of the stripes in semi-axes, and their amplitude, intensity; chosen, as is the largest number of objects.
 _PERIOD, _AMPLITUDE = 0.7, 0.15
 MOST_OBJECTS = 100
 

@@ -32,9 +32,11 @@ from ..core.arrays import FloatArray
 from ..core.errors import require
 from .atmosphere import Float64Array, Layer, PhaseScreenParams, phase_spectrum
 
-# The lattice takes over from the waves about two cells from the origin.
+# The lattice takes over from the waves about two cells from the origin, by the fourth power; both chosen.
 _CROSSOVER = 2.0
 _STEEPNESS = 4
+# Strata of the waves, chosen: the expected structure function is exact for any number.  Points along a side of the
+# lattice, chosen as well.
 _RINGS_PER_DECADE = 7
 _SECTORS = 12
 _SMALLEST_SCREEN, _LARGEST_SCREEN = 512, 2048

@@ -22,8 +22,10 @@ from .phase_screen import Turbulence, sample_lattice
 
 ComplexArray = NDArray[np.complex64]
 
-# The waves have little curvature over the pupil; components below this share of the largest are left out.
+# The waves have little curvature over the pupil; components below this share of the largest are left out; chosen.
 _BEND_TOLERANCE = 1e-3
+# Times and places from which components are found, least share of the variance that they keep, and most of them; all
+# chosen.
 _SAMPLED_INSTANTS, _SAMPLED_POINTS = 16, 32
 _KEPT_VARIANCE, _MOST_COMPONENTS = 0.99, 32
 

@@ -8,7 +8,7 @@ from ..core.arrays import FloatArray
 from .scenes import resolution_chart
 from .smooth_flow import SmoothFlowParams, distort, smooth_flows
 
-# Frames per second.
+# Frames per second.  It and all numbers below were chosen.
 RATE = 25
 _HEIGHT, _WIDTH, _FRAMES = 192, 256, 48
 _MOTION = SmoothFlowParams(rms=1.8, correlation_length=14.0, persistence=0.8)

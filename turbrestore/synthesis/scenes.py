@@ -21,17 +21,19 @@ from ..io.images.image_files import read_image
 if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont, ImageFont
 
+# Smallest scene that is drawn, pixels a side, chosen.
 SMALLEST = 64
 # Grey pictures, then those in colour.
 PICTURES = ("camera", "brick", "grass", "gravel", "coins", "moon", "page", "astronaut", "cat", "coffee", "rocket")
 _FILES = {"cat": "chelsea.png", "rocket": "rocket.jpg"}
 # Common words of five to eight letters, which are in the dictionary of a text recogniser.
 WORDS = ("harbour", "window", "engine", "seventh", "market", "glacier", "copper", "journey", "planet", "bridge")
+# Intensities of ink and paper, chosen.
 _DARK, _BRIGHT = 0.12, 0.88
-# Scenes are drawn this many times larger and averaged down, which avoids jagged edges.
+# Scenes are drawn this many times larger and averaged down, which avoids jagged edges; chosen.
 OVERSAMPLING = 4
+# Distance of lines in font sizes, and smallest font, whose letters are about half as high; both chosen.
 _LINE_SPACING = 1.2
-# Letters are about half as high as the font size.
 _SMALLEST_FONT = 6
 
 

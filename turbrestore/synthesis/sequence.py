@@ -21,6 +21,7 @@ from ..registration.flow import MIN_SIDE
 from ..registration.flow_algebra import invert_flow
 from ..registration.warp import warp
 
+# Smallest contrast of a scene: a quarter of a level of 8 bits, chosen.
 _LEAST_CONTRAST = 1e-3
 
 

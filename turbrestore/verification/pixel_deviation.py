@@ -51,9 +51,9 @@ from ..runtime.fourier import irfft2, rfft2
 
 # Full scale, less half a grey level of 8 bits.
 SATURATED = 1 - 0.5 / 255
-# Window in which the squared gradient is averaged, pixels.
+# Window in which the squared gradient is averaged, pixels, chosen.
 _WINDOW = 1.5
-# Share of R that is error, and the window in which R is averaged, pixels.
+# Share of R that is error, see "Registration", and the window in which R is averaged, pixels, chosen.
 _ERROR_SHARE, _SMOOTH = 0.7, 4.0
 # Longest side of the grid of frequencies; g hardly depends on it.
 _GRID = 256

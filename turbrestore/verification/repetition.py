@@ -17,11 +17,12 @@ import numpy as np
 
 from ..core.arrays import FloatArray, luminance
 
-# Side of the windows, pixels: three periods of the longest that is looked for.
+# Side of the windows, pixels: three periods of the longest that is looked for, 24 pixels, chosen.
 _SIDE = 72
-# Autocorrelation from which a pattern repeats; it falls by a third over a lag of a third of the window.
+# Autocorrelation from which a pattern repeats; it falls by a third over a lag of a third of the window.  At 0.35, a
+# fence within a scene does.
 _ALIKE = 0.5
-# Windows with detail have at least this share of the largest variance.
+# Windows with detail have at least this share of the largest variance, chosen.
 _DETAIL = 0.1
 
 

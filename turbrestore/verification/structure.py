@@ -43,15 +43,16 @@ UNSEEN, LEFT = 0.03, 0.3
 # Share of what is left that lasts, from which the scene itself changes.  Recorded and simulated clips of scenes that do
 # not change have up to 0.04, textures that live for a tenth of the clip and longer 0.17 and more.
 LASTING = 0.1
-# Standard deviation of the Gaussian before a gradient is taken, pixels.
+# Standard deviation of the Gaussian before a gradient is taken, pixels, chosen.
 _SCALE = 2.0
-# Edges of f have at least this share of its steepest gradients, and exceed that of the noise of a frame by this factor.
+# Edges of f have at least this share of its steepest gradients, and this multiple of those of noise; both chosen.
 _EDGE, _CLEAR = 0.1, 6.0
-# Cosine of the angle within which gradients have one direction.
+# Cosine of the angle within which gradients have one direction, about 45°.
 _ALIKE = 0.7
-# Percentile of the gradients that is taken for the steepest.
+# Percentile of the gradients that is taken for the steepest, chosen.
 _STEEPEST = 99
-# Frames that are compared, windows along an axis and their side, pixels; pixels at the border that are left out.
+# Frames that are compared, windows along an axis and their side, pixels, for their cost; pixels at the border that are
+# left out, of which the Gaussian and the derivative reach 9.
 _FRAMES, _WINDOWS, _SIDE, _BORDER = 15, 4, 256, 12
 
 Window = tuple[slice, slice]

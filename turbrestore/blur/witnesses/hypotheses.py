@@ -14,15 +14,16 @@ from ..psf import Float64Array, half_frequency
 from .short_exposure import displacement_variance, short_exposures
 from .spectral_variation import RINGS
 
-# Hypotheses: D/r0, λ/D and σ_l.
+# Hypotheses: D/r0, λ/D, about two standard deviations of its prior on either side, and σ_l; all chosen.
 _STRENGTHS = np.geomspace(0.5, 7, 11)
 _DIFFRACTIONS = np.geomspace(0.35, 4.5, 11)
 _LENSES = np.array([0.2, 0.35, 0.5, 0.7, 0.9, 1.1, 1.35, 1.6, 1.9, 2.3, 2.8, 3.4, 4.2, 5.2, 6.5, 8.0, 10.0])
-# D/r0 for one known λ/D.
+# D/r0 for one known λ/D, chosen.
 _FINE_STRENGTHS = np.geomspace(0.5, 7, 41)
-# Prior: usual λ/D and the standard deviation of its logarithm; share of air that does not blur; weights of the σ_l.
+# Prior, chosen: usual λ/D and the deviation of its logarithm; share of air that does not blur; weights of the σ_l.
 _USUAL_DIFFRACTION, _DIFFRACTION_SPREAD, _NO_BLUR = 1.4, 0.6, 0.05
 _LENS_PRIOR = np.array([22, 16, 12, 9, 9, 9, 8, 7, 5, 4.5, 4, 3, 1.5, 1, 0.7, 0.5, 0.3])
+# Least H of which a logarithm is taken, chosen.
 LEAST_TRANSFER = 1e-5
 
 

@@ -25,13 +25,14 @@ from ..estimation import BlurCandidate, BlurEstimate, choose_blur, find_candidat
 from ..marginal_likelihood import WIDTHS, image_gradients, width_costs
 from ..psf import Float64Array
 
-# Exponents of the transfer function: strong air, weak air behind an aperture, a lens.
+# Exponents of the transfer function: strong air, as of wide fused blurs, weak air behind an aperture, chosen, a lens.
 EXPONENTS = (1.2, 1.55, 2.0)
-# Rises of the cost after which wider blurs are not tried, and the cost of those above the smallest.
+# Rises of the cost after which wider blurs are not tried, and the cost of those above the smallest; both chosen.
 _RISES, _BEYOND = 4, 3.0
-# Largest reduction at which a blur may be narrower than this, in reduced pixels.
+# Largest reduction at which a blur may be narrower than this, in reduced pixels; both chosen: in a test a soft scene
+# has 0.91, and letters have 1.01.
 _TRUSTED, _RESOLVED = 2, 0.95
-# Share of the widest blur of an image from which its width may be beyond it.
+# Share of the widest blur of an image from which its width may be beyond it, chosen.
 _SATURATED = 0.95
 
 

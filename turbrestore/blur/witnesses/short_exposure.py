@@ -26,6 +26,7 @@ from ..psf import Float64Array
 # c for an outer scale between 20 and 1000 apertures: geometric mean, and standard deviation of its logarithm, in which
 # the outer scale has a share of 0.32, and the error of a measured displacement the rest.
 TILT, TILT_SPREAD = 0.114, 0.4
+# Least s and s_4 whose logarithm is taken: the table has less at u = 0 only, by rounding.
 _LEAST = 1e-7
 
 

@@ -30,9 +30,9 @@ from ...runtime.image_stacks import spline_planes
 from ...runtime.scratch import drop_pages
 from ..psf import Float64Array
 
-# Side of a window, and pixels around it that are left out at the border of the image.
+# Side of a window, and pixels around it that are left out at the border of the image; both chosen.
 SIDE, _BORDER = 64, 16
-# Most windows along an axis, and most frames.
+# Most windows along an axis, and most frames, for their cost.
 _WINDOWS, _FRAMES = 5, 48
 # Fewest frames that are compared, chosen.
 _FEWEST = 4
@@ -42,7 +42,7 @@ _NOISE_FRAMES, _NOISE_RINGS = 4, 4
 _LEAST_NOISE = 1e-8 * SIDE**2 * 9 / 64
 # Frequencies of the rings, cycles per pixel.
 RINGS: Float64Array = np.arange(SIDE // 2 + 1) / SIDE
-# The derivative of a flow is taken behind a Gaussian of this standard deviation, pixels.
+# The derivative of a flow is taken behind a Gaussian of this standard deviation, pixels, chosen.
 _SMOOTH = 2.0
 
 

@@ -36,8 +36,8 @@ from ...core.noise_spectrum import NoiseSpectrum
 from ...core.thresholds import threshold
 from ..psf import Float64Array, blur_otf
 
-# Widths that are tried, pixels.  The networks read at these too, so that others ask for networks that are trained anew
-# on clips that are made anew.
+# Widths that are tried, pixels, chosen.  The networks read at these too, so that others ask for networks that are
+# trained anew on clips that are made anew.
 GRID: Float64Array = np.geomspace(0.3, 9.0, 14)
 
 

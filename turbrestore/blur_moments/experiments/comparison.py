@@ -31,15 +31,16 @@ from ..state_estimation.lifting import LiftedSystem
 from ..state_estimation.observers import MomentFilter, Observer, run_observer, steady_kalman
 from .scenarios import SLOPE_DISTURBANCE, Recording, Setup, mirror_setup, record, wavefront_setup
 
-# Share of the exposures with the spot on the sensor below which light is lost.
+# Share of the exposures with the spot on the sensor below which light is lost, chosen.
 _LIT = 0.99
-# Probabilities at the ends of the consistency band.
+# Probabilities at the ends of the consistency band, which holds 95 %.
 _BAND = 0.025, 0.975
 # Seeds handled together: enough to amortise the overhead of NumPy, few enough to stay in the cache.
 _CHUNK = 25
 # Orders of the moments for which there is a bound.
 _MOMENTS = {"moments": (1, 2), "moments_1_to_4": (1, 2, 3, 4)}
-# Standard deviations of ln g, ln ω and ln ζ in the prior of the augmented state: ±7 dB are two of the gain.
+# Standard deviations of ln g, ln ω and ln ζ in the prior of the augmented state: half of the largest that are drawn for
+# a plant off by up to 7 dB, so that ±7 dB are two of the gain.
 _PLANT = np.array([0.4, 0.15, 0.35])
 
 

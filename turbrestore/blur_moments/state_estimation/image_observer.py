@@ -34,16 +34,17 @@ from .innovation import Innovation
 
 NORMS = ("map", "two", "infinity")
 _POWERS = {"map": (2,), "two": (2,), "infinity": (2, 8, 32)}
-# Distance of the shifted starts from the prediction, in standard deviations.
+# Distance of the shifted starts from the prediction, in standard deviations, chosen.
 _PERTURBED = 2.0
-# Iterations from every start before only the best ones continue, and their number.
+# Iterations from every start before only the best ones continue, and their number; both chosen.
 _TRIAL, _KEPT = 2, 3
-# Squared distances in units of the curvature: a step that the frame cannot resolve; two starts at the same minimum.
+# Squared distances in units of the curvature: a step that the frame cannot resolve; two starts at the same minimum;
+# both chosen.
 _SETTLED = 1e-3
 _SAME = 0.1
-# Share of the light that must fall on the pixels where no prior keeps the search from leaving them.
+# Share of the light that must fall on the pixels where no prior keeps the search from leaving them, chosen.
 _LIT = 0.5
-# Share of the prior information that keeps the covariance finite in a search without a prior.
+# Share of the prior information that keeps the covariance finite in a search without a prior, chosen.
 _WEAK = 1e-6
 
 

@@ -31,7 +31,8 @@ from ...filtering.estimates import Gaussian
 from ...filtering.kalman import predict
 from ..sensor import ExposureTiming, Float64Array
 
-# A direction of the state counts as unobservable below this share of the strongest effect on the output (float64).
+# A direction of the state counts as unobservable below this share of the strongest effect on the output (float64);
+# chosen.
 _OBSERVABLE = 1e-9
 # In float64 the two eigenvalues of a double root come out about 1e-8 apart.
 _APART = 1e-6

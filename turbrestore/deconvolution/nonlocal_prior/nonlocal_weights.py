@@ -29,11 +29,11 @@ from ...core.noise import estimate_noise
 from ...runtime.jit import jit
 from ...runtime.threads import map_ahead
 
-# A weight must be positive for its pair to stay in the graph.
+# A weight must be positive for its pair to stay in the graph; chosen.
 SMALLEST_WEIGHT = 1e-6
 # Powers of the graph for the bound of its norm, which is then two per cent above that after many.
 POWERS = 4
-# Rows and columns of a tile of the search.
+# Rows and columns of a tile of the search, for their cost.
 _TILE_ROWS, _TILE_COLUMNS = 64, 192
 # Sorts after all keys.
 _NO_KEY = int(np.iinfo(np.int32).max)

@@ -16,14 +16,17 @@ from ...core.arrays import luminance
 from ...core.gradient import sobel_gradient
 from ..survey import Survey
 
-# Deviation of a static pixel, and gradient of an edge, in units of the noise of a frame.
+# Deviation of a static pixel, and gradient of an edge, in units of the noise of a frame: tests of titles and clocks
+# fail at half and at double of either.
 STILL, DEVIATIONS = 2.5, 8.0
-# Largest change of a pixel that stays, in grey levels; least share of the frames that have an edge there, and of these
-# in which it stays; fewest connected pixels.
+# Largest change of a pixel that stays, in grey levels: rounding of both frames and half a level; least share of the
+# frames that have an edge there, and of these in which it stays, both chosen; fewest connected pixels: a test finds a
+# square of side four, whose edge has 12 pixels, and none of side three.
 _LEAST_SAME, _OFTEN, _REMAINS, FEWEST_STROKES = 1.5, 0.2, 0.25, 12
-# Fewest frames in which it stays, and the share that 10 % of the edges exceed in a scene that moves by a pixel.
+# Fewest frames in which it stays, as one repeats nothing, and the share that 10 % of the edges exceed in a scene that
+# moves by a pixel; beyond the last times that share, strokes beside others do not count, chosen.
 _TIMES, _USUAL, _ALMOST_USUAL = 2, 0.15, 1.5
-# Largest part of the frame that digits take.
+# Largest part of the frame that digits take, chosen.
 _MOST_DIGITS = 0.1
 # Distance from other strokes, pixels, within which a stroke may stay in fewer frames, and the least share of them;
 # both chosen.

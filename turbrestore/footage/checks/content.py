@@ -41,7 +41,8 @@ from .repeats import RepeatDetector
 from .scene_cuts import MOST_SCENES, Scene, SceneDetector, group_scenes, thumbnail, turned_back
 from .stuck_pixels import StuckPixelDetector, repair_stuck
 
-# Blank frames have at most this contrast or share of the median contrast; share of saturated pixels that is named.
+# Blank frames have at most this contrast, half a level of 8 bits, or this share of the median contrast; share of
+# saturated pixels that is named.  Both shares are chosen.
 LEAST_CONTRAST, BLANK_CONTRAST, _SATURATED = 1 / 510, 0.1, 0.5
 # What to do with an array in place of a source.
 _OPENED = "use open_frames(path) or FrameSource.from_array(frames)"

@@ -14,11 +14,11 @@ from ...io.pixels import PixelArray
 from ...io.source import FrameSource
 from .black_borders import black_border
 
-# Share of a frame that may be missing and is filled from around, and from which the frame shows too little.
+# Share of a frame that may be missing and is filled from around, and from which it shows too little; both chosen.
 FEW_MISSING, MOST_MISSING = 0.01, 0.5
-# Factor between the windows from which what no frame shows is continued.
+# Factor between the windows from which what no frame shows is continued, chosen.
 _WIDER = 3.0
-# Number of rings of values that are filled from the edge of a hole inwards.
+# Number of rings of values that are filled from the edge of a hole inwards, chosen.
 _WIDEST_HOLE = 32
 
 

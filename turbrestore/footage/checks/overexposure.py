@@ -17,7 +17,7 @@ class _Limits:
     """By how much an overexposed frame exceeds the half of the clip that has least white."""
 
     white: float = 0.05  # share of the values; what noise or the glitter of water turns white is less
-    # Factor of the level.  What turns white where the camera pans to a brighter part changes the level less.
+    # Factor of the level; both chosen.  What turns white where the camera pans to a brighter part changes it less.
     brighter: float = 1.25
 
 

@@ -27,15 +27,16 @@ from ...core.arrays import FloatArray, luminance
 from ...io.pixels import PixelArray
 from ...io.source import FrameSource, Window
 
+# Side of the thumbnails, pixels, chosen.
 _SIDE = 32
-# Similarity, 0 to 1, below which two frames show different scenes.
-_ALIKE = 0.5
+# Similarity, 0 to 1, below which two frames show different scenes.  See above.
+ALIKE = 0.5
 # The picture has turned since the frame before where the other way round is closer by as much and at most so many times
-# as far; smoothing of the thumbnails that tell it, and parts of a pixel by which they are shifted.  See above.
+# as far; smoothing of the thumbnails that tell it, chosen, and parts of a pixel by which they are shifted.  See above.
 _CLOSER, _TIMES_AS_FAR, _SMOOTHING, _PARTS = 0.03, 0.5, 1.0, 4
-# Rate at which the reference of a scene follows slow changes such as drift and daylight.
+# Rate at which the reference of a scene follows slow changes such as drift and daylight, chosen.
 _UPDATE_RATE = 0.1
-# Number of scenes that are remembered, so that one that returns is recognised.
+# Number of scenes that are remembered, so that one that returns is recognised, chosen.
 MOST_SCENES = 16
 
 
@@ -75,7 +76,7 @@ class SceneDetector:
         for label in candidates:
             alike, shift, turned = _similarity_either_way(detail, self._references[label], self._ways[label])
             best = max(best, alike)
-            if alike >= _ALIKE:
+            if alike >= ALIKE:
                 self._current, self._ways[label] = label, turned
                 # The reference follows the frame, so that jumps of the camera do not smear it.
                 moved = np.roll(self._references[label], shift, axis=(0, 1))
@@ -114,7 +115,7 @@ class SceneDetector:
     def _all_differ(self) -> bool:
         full = len(self._references) >= MOST_SCENES
         typical = float(np.median(np.array(self._alike))) if len(self._alike) else 1.0
-        return full or typical < (1 + _ALIKE) / 2 - 0.1
+        return full or typical < (1 + ALIKE) / 2 - 0.1
 
 
 def group_scenes(numbers: NDArray[np.int64], labels: NDArray[np.int32]) -> tuple[tuple[Scene, ...], NDArray[np.bool_]]:

@@ -17,17 +17,20 @@ from ...core.arrays import FloatArray
 from ...io.counts import NEIGHBOURS
 from ...io.pixels import PixelArray
 
+# Share of stuck pixels from which they are something else, chosen.
 _MOST_STUCK = 0.005
+# Fewest frames: tests find stuck pixels in 14, and none in 6.
 _FEWEST_FRAMES = 10
-# Distance, as a share of full scale, by which a stuck pixel lies outside the range of its neighbours.
+# Distance, as a share of full scale, by which a stuck pixel lies outside the range of its neighbours, chosen.
 _EXCESS = 0.05
-# Most frames in which all pixels are compared; afterwards only the remaining candidates are followed.
+# Most frames in which all pixels are compared, for the cost; afterwards only the remaining candidates are followed.
 _DENSE_FRAMES = 8
-# A lone pixel exceeds its highest neighbour by this share of its distance from the median of all neighbours.
+# A lone pixel exceeds its highest neighbour by this share of its distance from the median of all neighbours, chosen.
 _ALONE = 0.8
-# Largest change of a stuck pixel, and least mean change of its neighbours.
+# Largest change of a stuck pixel: rounding of both frames and half a level; and least mean change of its neighbours,
+# chosen.
 _STILL, _MOVING = 1.5 / 255, 8 / 255
-# A neighbour belongs to the same letter if it always stands out by at least this share of the height of the pixel.
+# A neighbour belongs to the same letter if it always stands out by this share of the height of the pixel, chosen.
 _OF_LETTER = 0.3
 # Places of the eight neighbours, from the pixel.
 _AROUND = np.argwhere(NEIGHBOURS) - 1

@@ -27,25 +27,27 @@ from ..correction import Correction
 from ..survey import Survey
 from .shadows import measure_shade
 
-# Longest side of the reduced frames, pixels.
+# Longest side of the reduced frames, pixels, chosen.
 _SIDE = 96
-# Blur of the frames that hides the motion of the air: pixels of the frame, and at least that many of the reduced one.
+# Blur that hides the motion of the air: pixels of the frame, and at least that many of the reduced one; both chosen.
 _BLUR, _LEAST_BLUR = 4.0, 1.5
-# Cosines along the rows: bands as narrow as an eighth of the frame are followed.
+# Cosines along the rows, chosen: bands as narrow as an eighth of the frame are followed.
 _COSINES = 16
 # Least change by the gain of a frame, and by bands, relative to the contrast of the scene, that is corrected.  Clips
 # under steady light, simulated and real, reach 0.01, and 0.03 along the rows where somebody walks through.
 _LEAST_CHANGE, _LEAST_BANDS = 0.025, 0.06
-# Share of these below which no model is fitted, as means over a frame include moving objects.
+# Share of these below which no model is fitted, as means over a frame include moving objects; chosen.
 _CLEARLY = 0.7
-# Share of the residual that a model has to explain of what a simpler one leaves.
+# Share of the residual that a model has to explain of what a simpler one leaves, chosen.
 _EXPLAINED = 0.3
+# Intensity from which a pixel is saturated: that of the two highest levels of 8 bits.
 _SATURATED = 0.995
-# Weight of a cosine of order j against its square, relative to the information of the frame.
+# Weight of a cosine of order j against its square, relative to the information of the frame, chosen.
 _SMOOTHNESS = 1e-4
-# Frames of the sample in which bands are looked for.
+# Frames of the sample in which bands are looked for, chosen.
 _SOME = 24
-# Rows at which gains are compared, the percentage of frames beyond the range that they wander in, and the least gain.
+# Rows at which gains are compared, eight to a period of the narrowest band; the percentage of frames beyond the range
+# that they wander in, and the least gain, both chosen.
 _NODES, _FEW, _LEAST_GAIN = 64, 5, 0.05
 
 

@@ -18,11 +18,11 @@ from ..correction import Correction
 from ..levels import Levels
 from ..survey import Survey
 
-# Clips that span less than this share of full scale are stretched to it, so that their scale does not matter.
+# Clips that span less than this share of full scale, chosen, are stretched to it, so that their scale does not matter.
 _SPAN = 0.7
-# Percentage of the frames at either end whose extremes do not count.
+# Percentage of the frames at either end whose extremes do not count, chosen.
 _FEW = 10
-# A contrast below one grey level of an 8-bit camera is a scene only if it is that many deviations of the noise.
+# A contrast below one grey level of an 8-bit camera is a scene only if it is that many deviations of the noise, chosen.
 _LEAST_CONTRAST, _DEVIATIONS = 1 / 255, 12.0
 
 

@@ -24,10 +24,11 @@ from ...io.pixels import PixelArray, planes_of, to_unit, with_planes
 from ...io.source import FrameSource
 from ..checks.missing_pixels import fill_holes
 
-# A pixel is hot where the dark exceeds its median by so many standard deviations, and by so much of full scale.
+# A pixel is hot where the dark exceeds its median by so many standard deviations, and by so much of full scale, and
+# dead where the flat is below so much of its mean; all chosen.
 _HOT_DEVIATIONS, _HOT_LEAST = 8.0, 0.01
 _DEAD = 0.1
-# Share of bad pixels from which something else is wrong.
+# Share of bad pixels from which something else is wrong, chosen.
 _MOST_BAD = 0.1
 
 

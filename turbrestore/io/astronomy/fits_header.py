@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 FITS_SUFFIXES = (".fits", ".fit", ".fts")
 _BLOCK = 2880
 _PIECE = 1 << 20
-# Cards of a header, and headers of a file before its first image.
+# Most cards of a header, a thousand blocks of them, and most headers of a file before its first image; both chosen.
 _MOST_CARDS, _MOST_HEADERS = 36_000, 100
 # Images of this name show the scene, and those of the other names say something about it.
 _SCENE = "SCI"

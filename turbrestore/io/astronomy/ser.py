@@ -38,7 +38,7 @@ TICKS_PER_SECOND = 10_000_000
 _MONO, _RGB, _BGR = 0, 100, 101
 _BAYER = {8: "rggb", 9: "grbg", 10: "gbrg", 11: "bggr"}
 _NAMES = {_MONO: "mono", _RGB: "rgb", _BGR: "bgr", **_BAYER}
-# Share of the roughness in the order of the header that the other order may have.
+# Share of the roughness in the order of the header that the other order may have, chosen.
 _SMOOTHER = 0.6
 
 

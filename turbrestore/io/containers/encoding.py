@@ -32,15 +32,17 @@ if TYPE_CHECKING:
 _WRITE_OPTIONS = {"fflags": "+bitexact"}
 _GREY_DEPTHS = {8: "gray", 10: "gray10le", 12: "gray12le", 14: "gray14le", 16: "gray16le"}
 _RGB_DEPTHS = {8: "bgr0", 10: "gbrp10le", 12: "gbrp12le", 14: "gbrp14le", 16: "gbrp16le"}
-# Matroska counts milliseconds.
+# Matroska counts milliseconds; the bound of MP4 was chosen.
 _MOST_FRAMES_PER_SECOND = {".mkv": 1000, ".mp4": 10000}
 _ENCODERS = {"h264": "libx264", "hevc": "libx265", "ffv1": "ffv1"}
+# Constant rate factors where none is given, chosen.
 _QUALITY = {"h264": 14, "hevc": 18}
 # x265 refuses smaller frames, and damages its memory when it does.
 _SMALLEST_HEVC = 16
-# x265 needs some frames to compute decoding times of reordered ones; without them it takes what its memory holds.
+# x265 needs some frames to compute decoding times of reordered ones, by default up to four in a row; without them it
+# takes what its memory holds.
 _REORDERED_HEVC = 4
-# Ticks a second of frames at irregular times, and what counts as irregular, in usual intervals.
+# Ticks a second of frames at irregular times, as in MPEG, and what counts as irregular, in usual intervals, chosen.
 _TICKS, _IRREGULAR = 90000, 0.1
 
 

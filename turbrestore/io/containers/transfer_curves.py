@@ -27,8 +27,10 @@ from ..pixels import PixelArray
 BT709, UNKNOWN, BT2020 = 1, 2, 9
 PQ, HLG = 16, 18
 _LOG = {9: "logarithmic codes", 10: "logarithmic codes"}
+# See the docstring; the knee was chosen, and the gamma is about that of sRGB.
 _WHITE, _PEAK, _KNEE = 203.0, 1000.0 / 203.0, 0.75
 _GAMMA = 2.2
+# Luminance of BT.2020, and the change to the primaries of BT.709; both follow from the primaries and the white.
 _LUMINANCE_2020 = np.array([0.2627, 0.6780, 0.0593], np.float32)
 _TO_BT709 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], np.float32)
 # Curves that cameras record for grading, as metadata name them.

@@ -41,6 +41,7 @@ _JPEG = (6, 7)
 _JPEG_END = b"\xff\xd9"
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB = 0, 1, 2
 _NOT_TIFF = "not a TIFF file, or damaged"
+# Most values per pixel, chosen.
 _MOST_SAMPLES = 16
 # Orientations that :func:`upright` changes, and the first of those in which width and height are exchanged.
 _ORIENTATIONS, _FIRST_ON_SIDE = range(2, 9), 5

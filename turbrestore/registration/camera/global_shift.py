@@ -32,19 +32,19 @@ from ...runtime.threads import map_ahead
 
 # Images are reduced by a whole factor until no side is longer; larger ones would only take longer.
 LONGEST_SIDE = 192
-# Window of the local contrast normalisation, pixels of the reduced image, and intensity deviation below which a region
-# counts as flat.
+# Window of the local contrast normalisation, pixels of the reduced image: with half of it, tests lose a camera that
+# turns, and with twice as much one that drifts.  Intensity deviation below which a region counts as flat, chosen.
 _WINDOW, _FLOOR = 6.0, 0.01
-# Standard deviation of the expected peak, pixels of the reduced image: turbulence smears it.
+# Standard deviation of the expected peak, pixels of the reduced image, chosen: turbulence smears it.
 _PEAK_WIDTH = 1.0
-# Correlation that a shift must reach, and its least gain over the correlation without a shift.
+# Correlation that a shift must reach, and its least gain over the correlation without a shift, both chosen.
 LEAST_CORRELATION, _LEAST_GAIN = 0.3, 0.1
-# Share of the image below which an overlap says nothing about the whole.
+# Share of the image below which an overlap says nothing about the whole, chosen.
 _LEAST_OVERLAP = 0.1
-# Shifts up to this many pixels are left to dense flow.
+# Shifts up to this many pixels, chosen, are left to dense flow, which follows 16 of them.
 DEAD_ZONE = 2.0
-# A flow moves as a whole if this share of it lies within the dead zone around its median; both are computed from at
-# most so many rows and columns.
+# A flow moves as a whole if this share of it, chosen, lies within the dead zone around its median; both are computed
+# from at most so many rows and columns, for their cost.
 _SHARE_OF_WHOLE, _SAMPLE = 0.75, 32
 
 Shift = NDArray[np.float64]

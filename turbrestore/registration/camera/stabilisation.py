@@ -28,9 +28,9 @@ from .global_shift import DEAD_ZONE, LEAST_CORRELATION, Shift, known_shifts, ove
 
 Matrix = NDArray[np.float64]
 
-# Frames that tell whether the camera turns, and by how many pixels the corners then move in most of them.
-_SAMPLES, _TURNS = 9, 2.0
-# Iterations of the correlation, and the change of it that ends them.
+# Frames that tell whether the camera turns, chosen.
+_SAMPLES = 9
+# Iterations of the correlation, and the change of it that ends them, chosen.
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-4)
 
 
@@ -132,7 +132,7 @@ def _turns(poses: dict[int, Matrix], shape: tuple[int, ...]) -> bool:
         return False
     linear = np.array([pose[:2, 0] for pose in poses.values()])
     turned = np.linalg.norm(linear - linear.mean(axis=0), axis=1) * np.hypot(shape[1], shape[2]) / 2
-    return float(np.median(turned)) > _TURNS
+    return float(np.median(turned)) > DEAD_ZONE
 
 
 def _placed(frame: FloatArray, pose: Matrix) -> FloatArray:

@@ -23,9 +23,9 @@ GreyImage = NDArray[np.uint8]
 # Takes frames (B, H, W), the flow that each starts from, or None, and whether drafts will do; returns flows
 # (B, H, W, 2).  Threads share a solver.
 FlowSolver = Callable[[GreyImage, list[FloatArray | None], bool], FloatArray]
-# Lines above which the flow of air is smooth over so many pixels that a quarter of the resolution will do.
+# Lines above which the flow of air is smooth over so many pixels that a quarter of the resolution will do, chosen.
 _LARGE = 1000
-# Level, above the finest, at which a search that has a start begins.
+# Level, above the finest, at which a search that has a start begins, chosen.
 _LEVELS_FROM_START = 1
 
 

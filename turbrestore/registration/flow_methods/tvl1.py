@@ -64,7 +64,7 @@ from .opencv_flow import FlowSolver, GreyImage
 from .tvl1_sweeps import FlowProblem, SweepParams, resize_dual, sweep
 
 MEDIANS = (1, 3, 5)
-# An image with a shorter side is not reduced further, so levels have at least half of this many pixels a side.
+# An image with a shorter side is not reduced further, so levels have at least half of it, as images must.
 _LEAST_SIDE = 32
 # Gradient, intensity per pixel, that regularises the division by |g|.
 _FLAT = 1e-6
@@ -75,7 +75,7 @@ _BATCHES_AT_A_TIME = 2
 _ONE = np.ones(1, np.float32)
 # Exact for polynomials of degree four.
 _DERIVATIVE = (np.array([1, -8, 0, 8, -1]) / 12).astype(np.float32)
-# Gaussian of 0.8 pixels before every second pixel is dropped.
+# Gaussian of 0.8 pixels, chosen, before every second pixel is dropped.
 _BLUR = np.exp(-(np.arange(-2, 3) ** 2) / (2 * 0.8**2))
 _REDUCTION = (_BLUR / _BLUR.sum()).astype(np.float32)
 
@@ -96,7 +96,8 @@ class TvL1Params:
     sweeps : int
         Primal-dual sweeps per warp.
     step : float
-        Step of the flow in a sweep (τ), pixels.
+        Step of the flow in a sweep (τ), pixels: it changes how fast sweeps converge, not to what.  The default was
+        chosen on other clips than those of the benchmark.
     median : int
         Side of the median filter after each warp; 1 switches it off, else 3 or 5.
     levels : int

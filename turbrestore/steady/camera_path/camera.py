@@ -19,7 +19,7 @@ from ...core.arrays import FloatArray
 
 Matrix = NDArray[np.float64]
 
-# Distance of the samples, at most, and number of fits.
+# Distance of the samples, at most, and number of fits, both chosen.
 _STEP, _FITS = 8, 4
 # Smallest median distance, pixels, so that an exact fit has weights.
 _LEAST_DISTANCE = 1e-3

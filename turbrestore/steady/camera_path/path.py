@@ -42,7 +42,7 @@ import numpy as np
 
 from .camera import Matrix, camera_size
 
-# Frames before k, and after it, that are kept.
+# Frames before k, and after it, that are kept, chosen.
 LONGEST = 48
 # Correlation times τ, frames, and ρ of the models: closer and wider grids give the same paths.
 _TIMES, _WALKS = (1.0, 3.0, 9.0), (1e-6, 1e-4, 1e-2, 1.0)
@@ -50,11 +50,11 @@ _TIMES, _WALKS = (1.0, 3.0, 9.0), (1e-6, 1e-4, 1e-2, 1.0)
 # 4 %, less rounds a sudden stop.
 _VELOCITY = 5.0
 # Every how many frames count where all are known, further away than four times as many: successive ones are alike.
-# Up to twice as many from k a camera may turn.
+# Up to twice as many from k a camera may turn.  Chosen.
 _EVERY = 3
-# Fewest times that a path is smoothed over.
+# Fewest times that a path is smoothed over, chosen.
 _FEWEST = 4
-# Error ε of a position, and the least e, pixels.
+# Error ε of a position, and the least e, pixels, chosen.
 _ERROR = 0.03
 
 
