@@ -53,8 +53,8 @@ _TRAINING_BYTES = 1.5e9
 # Peak without a limit from which training frames go to a scratch file, bytes; required free space as a multiple of it;
 # both chosen.
 _SPILL_ABOVE_BYTES, _FREE_SPACE_FACTOR = 2.2e9, 3
-# Interpreter, libraries and readers, bytes.  Runs at their limits in benchmarks/results/memory.md show that this and
-# what follows down to the report suffice, but not that less would not.
+# Interpreter, libraries and readers, bytes.  Runs with limits in benchmarks/results/memory.md show that this and what
+# follows down to the report suffice, but not that less would not.
 _BASE = 1.6e8
 # Memory of the preparation, bytes a pixel and bytes a pixel and channel.
 _PREPARED, _PREPARED_COLOUR = 44, 34

@@ -18,8 +18,8 @@ from .runtime.scratch import iter_frames
 
 # Border that is not compared, pixels, chosen.
 BORDER = 30
-# Margin that may contain values from outside after the sub-pixel shift, which is less than three pixels, chosen, and
-# interpolates over two more; it is cut off.
+# Margin that is cut off, because it may contain values from outside: the sub-pixel shift is less than three pixels, and
+# interpolates over two more.  Both chosen.
 _GUARD = 6
 _LARGEST_SHIFT = 3.0
 # The interior must contain the window of the structural similarity, 7×7 pixels.

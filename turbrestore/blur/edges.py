@@ -38,8 +38,8 @@ _SMOOTH = 0.7
 # Distance up to which edges rise, and A: widths of the blur, and pixels; all chosen.
 REACH_SIGMAS, _SMALLEST_REACH = 4.0, 6
 _RISE_SIGMAS, _SMALLEST_RISE = 1.75, 2
-# Steps count from this multiple of the noise, and from a share, here the last, of this percentile of all steps; all
-# chosen, the share on simulated discs of 60 to 150 pixels, of which tests fail at 0.3 and 1.
+# Steps count from _STEP times the noise, chosen, and from _STRONG times the percentile _MOST of all steps, chosen on
+# simulated discs of 60 to 150 pixels.
 _STEP, _MOST, _STRONG = 12.0, 90, 0.6
 # Share of the step, and multiple of the noise, by which a rising profile may fall; both chosen: tests fail with half
 # and with twice the share.
@@ -61,7 +61,7 @@ _RATIO = 1.05
 SOFT, _SHARP, PIXEL_UNCERTAINTY = 0.8, 0.35, 0.1
 # Side of a tile, pixels, chosen.
 TILE = 16
-# Frequencies over which M is integrated, cycles per pixel: at the last, the narrowest blur leaves 0.2 % at most.
+# Frequencies over which M is integrated, cycles per pixel: the narrowest blur leaves little beyond.
 _FREQUENCIES = np.linspace(0, 4, 1001)
 
 

@@ -58,8 +58,8 @@ if TYPE_CHECKING:
 # Factors by which the image is reduced; smallest side of a reduced image and of one that is analysed at all.  Chosen.
 _REDUCTIONS = (1, 2, 3, 4, 6, 8)
 _SMALLEST_SIDE, _SMALLEST_IMAGE = 60, 16
-# Smallest n, about what rounding to 12 bits leaves; share of the contrast; multiple of s_1, chosen like the share: more
-# noise everywhere costs clean clips up to 0.8 dB.
+# Smallest n, about what rounding to 12 bits leaves.  Share of the contrast, and multiples of s_1, both chosen: assuming
+# more noise everywhere costs clean clips up to 0.8 dB.
 LEAST_NOISE = 1e-4
 _MISFIT, _MULTIPLES = 0.025, (1.5, 2.0)
 # Ratios of s_2 to s_1, and shares of the contrast, between which the multiple grows; all chosen.

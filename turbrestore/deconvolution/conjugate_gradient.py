@@ -31,7 +31,7 @@ from .problem import MARGIN_SIGMAS, Problem, margin_around, total
 ROUNDING = 1e-14
 # Iterations for the Wiener solution that nltv and tv start from; further ones change it only near the border.  Chosen.
 _START_STEPS = 40
-# Contrast over noise in the fidelity of Wiener deconvolution; see wiener_fidelity.
+# Factor of contrast over noise in the fidelity of Wiener deconvolution; wiener_fidelity tells what it was chosen on.
 FIDELITY = 6.0
 
 

@@ -44,11 +44,10 @@ from .conjugate_gradient import ConjugateGradients
 from .primal_dual import EARLY, PrimalDual
 from .problem import Problem
 
-# Pixels a side of the tiles that changes are measured in.  Tiles of 32 go on for noise: 72 scenes took 124 iterations
-# to the same accuracy in place of 98.
+# Pixels a side of the tiles that changes are measured in, chosen: tiles of 32 go on for noise.
 TILE = 64
 # q is the mean over this many steps from window to window, of which there must be at least FEWEST; the prediction is at
-# most MOST times the last change.  With a SPAN of 5, a MOST of 3 took 123 iterations in place of 98, 10 and 20 took 99.
+# most MOST times the last change.  All chosen.
 SPAN, FEWEST, MOST = 3, 2, 6.0
 # The energy is recorded every so many iterations, a multiple of the windows of all solvers.
 _RECORD_EVERY = 10

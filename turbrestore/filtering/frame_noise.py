@@ -46,8 +46,8 @@ _LARGEST_EXPONENT = 40.0
 _LOG_INVALID = math.log(1e3)
 # Pixels around a fold that are invalid too, on each side, and standard deviation of the fade around them, chosen.
 _AROUND_FOLD, _FOLD_FADE = 3, 2.0
-# A frame that deviates from the usual by more than this many variances does not show the scene: less than 1 % of clean
-# clips did, and nine let a part of a flash through.  Deviation of the window that averages it, pixels, chosen.
+# A frame that deviates from the usual by more than this many variances does not show the scene: at six less than 1 % of
+# clean clips did, at nine a part of a flash passed.  Deviation of the window that averages it, pixels, chosen.
 OUTLIER, OUTLIER_WINDOW = 6.0, 3.0
 # Standard deviation of the Gaussian window in which sharpness is measured, pixels, chosen.
 SHARPNESS_WINDOW = 3.0

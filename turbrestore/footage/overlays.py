@@ -54,7 +54,7 @@ from .correction import Correction
 from .placement import Placement, camera_moves, relative_window
 from .survey import Moments, Survey
 
-# Fewest frames of a clip in which an overlay is looked for: a test finds one in three, and none in two.
+# Fewest frames of a clip in which an overlay is looked for: a test finds one in three.
 FEWEST = 3
 # An edge is static if it varies by less than its gradient times this share of the motion of the edges, or one pixel;
 # with a static camera, the edges move by at least so many pixels.  Tests fail at half and at double of either.
@@ -66,7 +66,7 @@ _SPAN, _RANGE = 0.5, (1, 99)
 # both chosen.
 _CONSTANT, _DARK = 0.5, 0.25
 # Fewest static edge pixels of an overlay, as a share of the frame, chosen, and the largest part of a frame that it may
-# cover: that of a stop around half of the frame, and not of one around nearly all.
+# cover: a stop that covers half of the frame is found, one that covers nearly all is not.
 _LEAST_EDGES, _LARGEST = 0.0005, 0.7
 # Least share of the scene, shown by no frame, that the decision states, chosen.
 _REPORTED = 0.002
@@ -84,7 +84,7 @@ _NOISELESS, _DRAWN = 0.7, 1 / 8
 # more.
 _LEAST_DRAWN, _BORDER = 1 / 3, 3
 # A part of a title has moved if edges with this share of its squared gradients are so many pixels from where they were,
-# chosen: a test moves a third and two thirds of them, by less and by more.
+# chosen: in a test two thirds of them move by less, or a third by more, and it stays; two thirds by more, and it goes.
 _MOVED, _MOTION = 0.5, 0.5
 # What is static is half-transparent if less than this share of it, without its edges, lacks noise.  On photographs of a
 # cup, a person and bricks behind words of an opacity of 0.35 or less, 0.02 or less does, with a static or a shaking

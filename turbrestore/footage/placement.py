@@ -14,8 +14,8 @@ from ..core.arrays import FloatArray
 from ..io.source import Window
 from .survey import reduced_shape
 
-# Root mean square of the shifts of frames from which the camera moves, pixels: the air alone moves frames by less.  A
-# test moves a camera by two pixels and by four.
+# Root mean square of the shifts of frames from which the camera moves, pixels: the air alone moves frames by less;
+# chosen.
 _MOVING = 3.0
 
 

@@ -47,8 +47,8 @@ MODES = ("fused", "single")
 # If the mean flow keeps this share of its length, chosen, from one iteration to the next, it is the method's bias.  If
 # it grows by more than the reciprocal, registration has failed.
 _STALLED = 0.8
-# Weight of a sample of the repeated border, where a sample inside the frame has 1.  It counts only where no frame shows
-# a pixel, so any small weight does.
+# Weight of a sample of the repeated border, where a sample inside the frame has 1.  It is to count
+# where no frame shows a pixel; chosen.
 _UNSEEN = 1e-3
 # Root mean square of one component of the displacement above which flows are searched for anew: a quarter of the side
 # of a matched patch, pixels, and half the distance over which the detail of the image changes by its deviation.  Within

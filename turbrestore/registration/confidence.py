@@ -40,11 +40,11 @@ from ..runtime.jit import jit
 # Standard deviations of the windows of the gradient and of the tensor, pixels, both chosen.
 _GRADIENT_WINDOW, _TENSOR_WINDOW = 1.0, 2.0
 _AREA = 4 * np.pi * _TENSOR_WINDOW**2
-# Eigenvalues of white noise exceed three times the variance of a derivative in 4 of 100,000 pixels, twice it in 180.
+# The noise of a derivative rarely exceeds three times its variance; chosen.
 _NOISE_MARGIN = 3.0
 # Variance of Scharr's derivative, in that window, of white noise of unit variance.
 _SCHARR_NOISE = 0.0214
-# m/τ², of an m of 10 and a τ of half a pixel, a pixel^−2, and κ, both chosen.
+# m / τ² with m = 10 and τ = 0.5 pixels, per squared pixel; and κ.  Both chosen.
 _METHOD_ERROR = 40.0
 _TILT = 0.01
 # Noise below which the errors of a flow method do not average out in a wider window, intensity.  Without this floor, a

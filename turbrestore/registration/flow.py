@@ -55,8 +55,8 @@ _LEVELS_PER_DEVIATION = 32.0
 _PIXELS_A_DEVIATION = 3
 # Most batches that are prepared for a device side by side, chosen.
 _BATCHES = 8
-# Share of the gradients of a frame above which noise makes it one that is smoothed: at a noise of 0.05 a chart, which
-# does not gain, is below, and a photograph above.  By so many pixels: wider smoothing gains nothing.
+# Share of the gradients of a frame above which noise makes it one that is smoothed: at a noise of 0.05 a photograph
+# exceeds it, and a chart, which would not gain, does not.  Width of the smoothing, pixels: more gains nothing.
 _NOISY, _SMOOTHING = 0.08, 1.0
 
 

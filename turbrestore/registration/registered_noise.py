@@ -46,8 +46,8 @@ from .warp import warp
 Frames = Sequence[FloatArray] | FloatArray
 # Frames whose noise is looked at: their windows tell the spectrum to a few percent.
 _FRAMES = 8
-# Fewest frames that hold two periods of alternate pairs, and rings on either side that tell ρ together: two lead
-# from the lowest beyond those that do not count; with four, a test of known ρ fails.
+# Fewest frames that hold two periods of alternate pairs, and rings on either side that tell ρ together, chosen: with
+# four, a test of known ρ fails.
 _FEWEST, _AROUND = 8, 2
 # ρ up to which all is taken for noise, chosen: a recursion over time that keeps three fifths of the last frame.  From
 # the second on nothing is: textures that live for a tenth of a clip of 40 frames have 0.78.

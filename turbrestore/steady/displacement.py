@@ -48,17 +48,17 @@ from .camera_path.camera import Matrix, camera_flow, camera_size
 
 # Window in which |S|² is averaged, pixels; share of the frame itself; both chosen.
 _WINDOW, _OWN_SHARE = 4.0, 0.5
-# c over the median of |S_i| while the camera is static; smallest and largest c, pixels; all chosen.  Behind strong
-# air, a largest of 4 was too little.
+# c over the median of |S_i| while the camera is static; smallest and largest c, pixels; all chosen: with a
+# largest c of 4, strong air was not taken out.
 _SIZES, _LEAST, _MOST = 2.5, 1.0, 8.0
 # Distance of the camera from motion at constant velocity, pixels, at which it counts as half shaking; what turbulence
 # moves whole frames by comes on top.  With half or twice as much, strong air is not told from a shake in test_path.py.
 _SHAKE = 2.0
 # Path, in units of c, at which an S_i of one neighbour counts half, chosen.
 _PATH = 1.5
-# Agreement of the neighbours below which a point moves; longest path of turbulence, in units of c; chosen.
+# Agreement of the neighbours below which a point moves; longest path of turbulence, in units of c; both chosen.
 _AGREEMENT, _LONGEST_PATH = 0.5, 2.0
-# Window of the differences of images, pixels, as in the fusion, and the smallest that counts, intensity; chosen.
+# Window of the differences of images, pixels, and the smallest that counts, intensity; both chosen.
 _IMAGE_WINDOW, _DIFFERENCE = 2.0, 0.04
 # Every so many pixels of the grid enter the median, for its cost.
 _SAMPLE = 3

@@ -66,7 +66,7 @@ from .windows import coarse_image, light_between, relit
 # Flow between two images (h, w, 2): reference, image, where the search starts, shape of the frames.
 Flow = Callable[..., FloatArray]
 
-# Longest memory, frames, chosen: geometry that follows by a twelfth a frame, in place of a 64th, is 0.1 dB worse.
+# Longest memory, frames, chosen: a geometry that follows by 1/12 a frame in place of 1/64 is 0.1 dB worse.
 _LONGEST = 64
 # Window from which r is filled in, pixels, chosen.
 _SURROUNDINGS = 12.0
@@ -76,7 +76,7 @@ _MARGIN, _MARGIN_EDGE = np.ones((5, 5), np.uint8), 1.5
 _BESIDE = np.ones((25, 25), np.uint8)
 # Least weight of the surroundings that a flow is filled in from, chosen; with less it fades.
 _LEAST_WEIGHT = 0.05
-# What weak turbulence displaces at most, which leaves nothing to the memory, and strong turbulence, pixels, chosen.
+# What weak turbulence displaces at most, which leaves nothing to the memory, and strong one, pixels; both chosen.
 _WEAK, _STRONG = 1.2, 1.8
 # Least g_A, chosen: an offset from the path of the camera falls to 1/e within 12 frames.
 _PULL = 1 / 12

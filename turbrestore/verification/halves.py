@@ -58,8 +58,8 @@ _LEAST_TINT, _TINT = 1 / 255, 2 / 255
 _ROWS, _AROUND = 256, 128
 # Bytes a pixel, and a pixel and channel, of these rows.
 _BYTES, _CHANNEL_BYTES = 74, 50
-# Share of the detail from which on the frames do not agree on the image as a whole, chosen; clips that it was tried on
-# are named in benchmarks/decisions/guards.md.
+# Share of the detail from which on the frames do not agree on the image as a whole, chosen on 65 clips, as
+# benchmarks/decisions/guards.md tells.
 MOSTLY = 0.5
 # Least g, and the share of the image that has it, that is worth a remark, chosen.
 _CLEAR, _REMARKED = 0.5, 0.15

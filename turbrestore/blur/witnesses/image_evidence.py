@@ -25,7 +25,7 @@ from ..estimation import BlurCandidate, BlurEstimate, choose_blur, find_candidat
 from ..marginal_likelihood import WIDTHS, image_gradients, width_costs
 from ..psf import Float64Array
 
-# Exponents of the transfer function: strong air, as of wide fused blurs, weak air behind an aperture, chosen, a lens.
+# Exponents of the transfer function: strong air, that of wide fused blurs; weak air behind an aperture, chosen; a lens.
 EXPONENTS = (1.2, 1.55, 2.0)
 # Rises of the cost after which wider blurs are not tried, and the cost of those above the smallest; both chosen.
 _RISES, _BEYOND = 4, 3.0

@@ -23,8 +23,8 @@ STILL, DEVIATIONS = 2.5, 8.0
 # frames that have an edge there, and of these in which it stays, both chosen; fewest connected pixels: a test finds a
 # square of side four, whose edge has 12 pixels, and none of side three.
 _LEAST_SAME, _OFTEN, _REMAINS, FEWEST_STROKES = 1.5, 0.2, 0.25, 12
-# Fewest frames in which it stays, as one repeats nothing, and the share that 10 % of the edges exceed in a scene that
-# moves by a pixel; beyond the last times that share, strokes beside others do not count, chosen.
+# Fewest frames in which it stays: one repeats nothing.  Share that 10 % of the edges exceed in a scene that moves by a
+# pixel.  Where they exceed the last times that share, strokes beside others do not count; chosen.
 _TIMES, _USUAL, _ALMOST_USUAL = 2, 0.15, 1.5
 # Largest part of the frame that digits take, chosen.
 _MOST_DIGITS = 0.1

@@ -23,8 +23,8 @@ from ..survey import Survey
 _COMPONENTS, _SAMPLES = 4, 256
 # Least share of the variance of a component between two states, and largest part of the picture that holds most of its
 # energy.  A sign has 0.98 or more, in 0.10 of the picture; of 30 other clips, static, shaking and zooming ones, those
-# above 0.90 are a zoom, with 0.94 in 0.49, and the Moon, with 0.90 in 0.56.  Most is 0.9, on a grid of 16×16 blocks,
-# both chosen.
+# above 0.90 are a zoom, with 0.94 in 0.49, and the Moon, with 0.90 in 0.56.  As most counts `_MOST` of the energy, on a
+# grid of 16×16 blocks; both chosen.
 _TWO, _LARGEST, _MOST, _GRID = 0.96, 0.25, 0.9, 16
 # Least share of the frames in either state, chosen: what fewer show is replaced as a moving object is.
 _LEAST = 0.25

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 _REVERSED_BITS = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
 _EBML_HEADER, _MATROSKA_SEGMENT = b"\x1aE\xdf\xa3", b"\x18S\x80g"
 _MP4_BOXES = (b"ftyp", b"moov", b"mdat", b"moof", b"mfra", b"wide", b"free", b"skip", b"pnot", b"styp", b"sidx")
-# Some writers include the RIFF header, of 12 bytes, in a size that should exclude it.
+# Some writers include the RIFF header in a size that should exclude it, and pad the end; chosen.
 _RIFF_SLACK = 16
 
 

@@ -41,7 +41,7 @@ _PEAK_WIDTH = 1.0
 LEAST_CORRELATION, _LEAST_GAIN = 0.3, 0.1
 # Share of the image below which an overlap says nothing about the whole, chosen.
 _LEAST_OVERLAP = 0.1
-# Shifts up to this many pixels, chosen, are left to dense flow, which follows 16 of them.
+# Shifts up to this many pixels, chosen, are left to dense flow.  From as many on, a camera turns.
 DEAD_ZONE = 2.0
 # A flow moves as a whole if this share of it, chosen, lies within the dead zone around its median; both are computed
 # from at most so many rows and columns, for their cost.

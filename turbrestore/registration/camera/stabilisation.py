@@ -28,7 +28,7 @@ from .global_shift import DEAD_ZONE, LEAST_CORRELATION, Shift, known_shifts, ove
 
 Matrix = NDArray[np.float64]
 
-# Frames that tell whether the camera turns, chosen.
+# Frames that tell whether the camera turns, chosen: in most of them the corners then move by more than the dead zone.
 _SAMPLES = 9
 # Iterations of the correlation, and the change of it that ends them, chosen.
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-4)
