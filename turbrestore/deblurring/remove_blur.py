@@ -32,7 +32,7 @@ from .decisions import explain_blur, explain_choice, explain_guards, explain_pos
 from .guards import BACK_OFF, GuardParams, GuardReading, evaluate_guards
 
 # Bytes per pixel, and per pixel and channel, of what is computed before and after the deconvolution; the guards take
-# most.
+# most.  Measured, and rounded up; benchmarks/memory.py --stages measures them again.
 _BYTES, _CHANNEL_BYTES = 22, 2
 # Bytes per pixel and channel of the results of two attempts.
 _RESULTS_BYTES = 8

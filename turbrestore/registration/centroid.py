@@ -52,7 +52,7 @@ _STALLED = 0.8
 _UNSEEN = 1e-3
 # Root mean square of one component of the displacement above which flows are searched for anew: a quarter of the side
 # of a matched patch, pixels, and half the distance over which the detail of the image changes by its deviation.  Within
-# either distance, a search at full resolution recovers.
+# either distance, a search at full resolution recovers.  Both chosen.
 _FAR, _FAR_OF_DETAIL = 2.0, 0.5
 # Share of the variance of the frames, without the motion of whole frames, that flows leave at most where displacement
 # makes it: on water whose waves shine they leave more than half, in turbulence less than a third.

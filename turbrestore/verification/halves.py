@@ -52,7 +52,8 @@ _FLAT = 7
 _NONE, _ALL = 0.3, 0.8
 # Energy that is nothing, squared intensity, about that of rounding to 12 bits.
 _NOTHING = 1e-8
-# Difference of colours, intensity, from which those of the mean begin to count, and from which they alone do.
+# Difference of colours, intensity, from which those of the mean begin to count, and from which they alone do: one and
+# two levels of 8 bits, chosen.
 _LEAST_TINT, _TINT = 1 / 255, 2 / 255
 # Rows that are worked on at once, and those around that count: four deviations of each band and of the widest window.
 _ROWS, _AROUND = 256, 128
