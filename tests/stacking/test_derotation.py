@@ -94,7 +94,7 @@ def test_the_mean_of_two_and_a_half_minutes_of_jupiter_gains_three_decibels(way)
     assert np.abs(part - turned.read()[:, 30:78, 40:104])[:, 6:-6, 6:-6].max() < 0.02
 
 
-# Degrees a day: of system II, by which Jupiter is observed; of Saturn's system III and of Mars, Archinal and others 2018.
+# Degrees a day: of system II for Jupiter, system III for Saturn, and of Mars (Archinal et al. 2018).
 @pytest.mark.parametrize(("planet", "rate"), [("jupiter", 870.27), ("saturn", 810.7939), ("mars", 350.89198)])
 def test_planets_turn_by_their_sidereal_periods(planet, rate):
     assert read_rotation(planet).period == pytest.approx(24 * 360 / rate, rel=5e-5)
