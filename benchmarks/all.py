@@ -70,6 +70,7 @@ TABLES = {
     "steady": Table("steady.py reported"),
     "stacking": Table("stacking.py"),
     "verdicts": Table("verdicts.py"),
+    "answers": Table("answers.py"),
     "flow_calls": Table("flow_calls.py", timed=True),
     "presets": Table("flow_calls.py --presets", timed=True),
     "speed": Table("speed.py", timed=True),

@@ -71,7 +71,7 @@ def simulate(seed: int, simulator: str | None = None, images: list[NDArray[np.ui
     else:
         name, scene = GIVEN, part_of_images(images, side + 2 * MARGIN, rng)
     count = int(np.exp(rng.uniform(np.log(4), np.log(100))))
-    frames, truth = _SIMULATORS[simulator](scene, count, rng)
+    frames, truth = SIMULATORS[simulator](scene, count, rng)
     bare = truth.copy()
     if rng.uniform() < 0.1:
         _burn_in_title([*frames, truth], rng)
@@ -205,7 +205,7 @@ def _none(scene: FloatArray, count: int, rng: np.random.Generator) -> tuple[Floa
     return _moved(scene, [scene] * count, flows * (rng.uniform() < 0.6))
 
 
-_SIMULATORS = {
+SIMULATORS = {
     "screens": _screens,
     "kernels": _kernels,
     "lens": _lens,
