@@ -51,7 +51,9 @@ def test_the_distance_of_stars_counts_to_half_a_pixel():
 
 def test_one_star_and_two_without_a_dip_between_them_are_not_two():
     assert answers.two_apart(stars((24, 30, 0.8)), 2.0) == 0
-    assert answers.two_apart(stars((24, 30, 0.8), (26, 30, 0.7), width=3.0), 2.0) == 0
+    merged, shallow = (stars((24, 30, 0.8), (24 + apart, 30, 0.8), width=3.0) for apart in (2.0, 7.2))
+    for image in (merged, shallow):
+        assert not any(answers.two_apart(image, separation) for separation in np.arange(1, 10, 0.5))
 
 
 def test_a_hot_pixel_beside_two_stars_is_no_star():
