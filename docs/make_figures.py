@@ -40,6 +40,7 @@ GALLERY = {
     "chart": (lambda: resolution_chart(SIDE, SIDE), "weak", 48, 0.005),
     "words": (lambda: printed_words(SIDE, SIDE), "strong", 60, 0.005),
     "sign": (lambda: road_sign(SIDE, SIDE), "medium", 48, 0.005),
+    "label": (lambda: scenes.label(SIDE, SIDE), "strong", 60, 0.005),
     "photographer": (lambda: picture("camera", SIDE, SIDE), "medium", 60, 0.005),
     "cat": (lambda: picture("cat", SIDE, SIDE), "medium", 60, 0.005),
     "planet": (lambda: planet(SIDE, SIDE), "medium", 120, 0.03),
