@@ -90,5 +90,7 @@ def open_clip(path: Path, name: Path) -> Clip:
     cleaned = clean_source(whole, content)
     facts = describe_clip(cleaned, content)
     # Frames that are left out can be shown as well.
-    shown = dataclasses.replace(whole, pixels=cleaned.pixels, repair=cleaned.repair, bayer=cleaned.bayer)
+    shown = dataclasses.replace(
+        whole, file_shape=cleaned.file_shape, pixels=cleaned.pixels, repair=cleaned.repair, bayer=cleaned.bayer
+    )
     return Clip(path, name, shown, facts)

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from turbrestore.core.errors import DataError
+from turbrestore.footage.checks.content import check_content, clean_source
+from turbrestore.footage.sensor.calibration import calibrated, make_calibration
 from turbrestore.io.source import FrameSource
 from turbrestore.io.video import open_frames, write_video
 from turbrestore.memory_plan import plan_memory
@@ -64,6 +66,25 @@ def test_every_setting_belongs_to_one_stage_or_changes_nothing_that_is_kept():
     assert {item.name for item in dataclasses.fields(RestoreParams)} - held == idle
     assert sum(len(stage) for stage in facts.values()) == len(held)
     assert set(dataclasses.asdict(params.flow)) == set(facts["centroid"]["flow"])
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_another_dark_frame_is_another_clip_however_it_is_read(channels, turned):
+    rng = np.random.default_rng(0)
+    frames = np.uint8(rng.integers(60, 200, (40, 40)) + rng.integers(0, 6, (8, 40, 40)))
+    if turned:
+        frames[5:] = frames[5:, ::-1, ::-1]
+    source = FrameSource.from_array(np.squeeze(np.repeat(frames[..., None], channels, axis=-1)))
+    facts = []
+    for level in (None, 5, 9):
+        dark = None if level is None else FrameSource.from_array(np.full_like(next(source.native()), level)[None])
+        seen = source if dark is None else calibrated(source, make_calibration(source, dark, None))
+        cleaned = clean_source(seen, check_content(seen))
+        assert len(cleaned.shape) == 3
+        params = RestoreParams()
+        facts.append(stage_dependencies(cleaned, params, plan_memory(cleaned.shape, params, DEFAULT))["centroid"])
+    assert facts[0] != facts[1] != facts[2]
 
 
 def test_another_version_and_one_with_other_results_start_again(ended, monkeypatch, capsys):

@@ -15,7 +15,7 @@ import numpy as np
 from ..core.arrays import FloatArray, luminance
 from ..core.errors import DataError
 from ..core.robust import robust_scale
-from ..io.pixels import PixelArray, to_unit
+from ..io.pixels import PixelArray, to_unit, unrepaired
 from ..io.source import FrameSource, numbers_text
 from .checks.missing_pixels import fill_holes
 
@@ -142,8 +142,3 @@ def _shown(source: FrameSource) -> Iterator[FloatArray]:
     for number, pixels in zip(source.numbers, source.native(), strict=True):
         whole = fill_holes(pixels) if np.issubdtype(pixels.dtype, np.floating) else pixels
         yield to_unit(whole, source.full_scale, f"{source.name}: frame {number}")
-
-
-def unrepaired(pixels: PixelArray) -> PixelArray:
-    """Repair nothing: where there is a repair, a kept run depends on the remarks of a source."""
-    return pixels

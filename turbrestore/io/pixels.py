@@ -63,6 +63,11 @@ def to_unit(pixels: PixelArray, full_scale: float, name: str, remedy: str = "") 
     return np.clip(values, 0, 1, out=values)
 
 
+def unrepaired(pixels: PixelArray) -> PixelArray:
+    """Repair nothing: where there is a repair, a kept run depends on the remarks of a source."""
+    return pixels
+
+
 def full_scale_of(dtype: np.dtype[Any], name: str) -> int:
     """Value that means intensity 1: the maximum of an unsigned integer type, 1 for floating point.
 

@@ -17,7 +17,7 @@ from .digests import content_digest, file_digest
 from .run_record import versions
 
 # Raised where the same frames and settings begin to give another image.
-_RESULTS = 14
+_RESULTS = 15
 _OPTICS = ("pixel_scale", "aperture", "distance", "wavelength")
 
 

@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 
 from ..core.arrays import FloatArray, luminance
 from ..core.errors import ConfigurationError, DataError
-from ..footage.object_crop import find_object, unrepaired
+from ..footage.object_crop import find_object
+from ..io.pixels import unrepaired
 from ..io.source import FrameSource, Window
 from ..registration.camera.global_shift import correlation
 from ..registration.warp import warp

@@ -12,6 +12,7 @@ overexposed frames    brighter, and with more white, than half of the frames    
 cuts                  two frames are not similar under any shift                         keeps the longest scene
 turned frames         similar to the others once they are turned by 180°                 turns them back
 saturation            half of the values or more are white                               only warns
+equal channels        three channels are equal in every frame                            reads one of them
 ====================  =================================================================  =============================
 
 :func:`without_blank` finds blank frames alone, and leaves them out.
@@ -35,6 +36,7 @@ from ...core.remarks import Doubt, counted
 from ...io.pixels import PixelArray, mosaic_places, plane_places, planes_of, to_unit, with_planes
 from ...io.source import FrameSource, numbers_text
 from .black_borders import BlackBorderDetector, without_border
+from .colourless import is_grey, may_be_grey, read_as_grey
 from .missing_pixels import FEW_MISSING, MOST_MISSING, Backdrop, backdrop_of_file, fill_holes, mean_backdrop
 from .overexposure import overexposed
 from .repeats import RepeatDetector
@@ -97,6 +99,8 @@ class ContentReport:
     backdrop : Backdrop or None
         What frames show behind pixels that others lack; None if no frame lacks more than 1 % and there are no black
         borders.
+    grey : bool
+        Whether the three channels of every frame are equal, of which :func:`clean_source` then reads one.
     """
 
     numbers: range | tuple[int, ...]
@@ -113,6 +117,7 @@ class ContentReport:
     left_out: frozenset[int]
     warnings: tuple[str, ...]
     backdrop: Backdrop | None = None
+    grey: bool = False
 
 
 def check_content(source: FrameSource, params: ContentParams | None = None) -> ContentReport:
@@ -188,7 +193,8 @@ def clean_source(source: FrameSource, report: ContentReport) -> FrameSource:
         repair=repaired if fill or len(stuck) else source.repair,
         unseen=source.unseen if backdrop is None or not backdrop.unseen.any() else backdrop.unseen,
     )
-    return turned_back(cleaned, frozenset(report.turned)) if report.turned else cleaned
+    cleaned = turned_back(cleaned, frozenset(report.turned)) if report.turned else cleaned
+    return read_as_grey(cleaned) if report.grey else cleaned
 
 
 def without_blank(source: FrameSource) -> tuple[FrameSource, tuple[Decision, ...]]:
@@ -216,6 +222,7 @@ class _ContentScan:
 
     def __init__(self, source: FrameSource) -> None:
         self._source = source
+        self._grey = may_be_grey(source)
         self._previous: PixelArray | None = None
         self._contrasts = array("d")
         self._usual = 0.0
@@ -234,6 +241,7 @@ class _ContentScan:
 
     def update(self, number: int, pixels: PixelArray, mosaic: PixelArray | None) -> None:
         pixels = self._with_holes_filled(number, pixels)
+        self._grey = self._grey and is_grey(pixels)
         values = to_unit(pixels, self._source.full_scale, f"{self._source.name}: frame {number}")
         self._white.append(np.count_nonzero(values >= 1) / values.size)
         self._levels.append(float(values.mean()))
@@ -307,6 +315,7 @@ class _ContentScan:
             left_out=frozenset(numbers[left_out].tolist()),
             warnings=(),
             backdrop=backdrop,
+            grey=self._grey,
         )
         return dataclasses.replace(report, warnings=tuple(_in_words(report, bool(repeated))))
 
@@ -369,6 +378,8 @@ def _in_words(report: ContentReport, repeated: bool) -> list[str]:
     if report.turned:
         which = numbers_text(report.turned)
         lines.append(f"{len(report.turned)} turned by 180°, as by the meridian flip of a mount: {which} turned back")
+    if report.grey:
+        lines.append("its three channels are equal: read as grey")
     if report.saturated >= _SATURATED:
         lines.append(f"{100 * report.saturated:.0f} % of the values are at white: detail there is lost")
     return lines

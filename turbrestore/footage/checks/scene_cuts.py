@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...core.arrays import FloatArray, luminance
-from ...io.pixels import PixelArray
+from ...io.pixels import PixelArray, unrepaired
 from ...io.source import FrameSource, Window
 
 # Side of the thumbnails, pixels, chosen.
@@ -143,7 +143,7 @@ def turned_back(source: FrameSource, turned: frozenset[int]) -> FrameSource:
         for number, frame in zip(chosen, dataclasses.replace(whole, numbers=tuple(chosen)).native(), strict=True):
             yield _turn(frame, source.window) if number in turned else frame
 
-    return dataclasses.replace(source, pixels=pixels, repair=None, bayer=None)
+    return dataclasses.replace(source, pixels=pixels, repair=source.repair and unrepaired, bayer=None)
 
 
 def _turn(frame: PixelArray, window: Window) -> PixelArray:
