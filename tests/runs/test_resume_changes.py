@@ -70,13 +70,13 @@ def test_every_setting_belongs_to_one_stage_or_changes_nothing_that_is_kept():
 
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("channels", [1, 3])
-def test_another_dark_frame_is_another_clip_however_it_is_read(channels, turned):
+def test_another_dark_frame_is_another_clip_however_it_is_read(tmp_path, channels, turned):
     rng = np.random.default_rng(0)
     frames = np.uint8(rng.integers(60, 200, (40, 40)) + rng.integers(0, 6, (8, 40, 40)))
     if turned:
         frames[5:] = frames[5:, ::-1, ::-1]
-    source = FrameSource.from_array(np.squeeze(np.repeat(frames[..., None], channels, axis=-1)))
-    facts = []
+    np.save(tmp_path / "clip.npy", np.squeeze(np.repeat(frames[..., None], channels, axis=-1)))
+    source, facts = open_frames(tmp_path / "clip.npy"), []
     for level in (None, 5, 9):
         dark = None if level is None else FrameSource.from_array(np.full_like(next(source.native()), level)[None])
         seen = source if dark is None else calibrated(source, make_calibration(source, dark, None))
