@@ -84,7 +84,7 @@ def measure(clip: Clip, truth: FloatArray) -> Row:
     whole = restore(clip.frames)
     row = {"default": score(whole.image)}
     row |= {name: score(restore(clip.frames, params).image) for name, params in VARIANTS.items()}
-    filtered, removed, shape = _stages(whole)
+    filtered, removed, shape = stages(whole)
 
     def deblurred(sigma: float, method: Method = "nltv", exponent: float = shape) -> float:
         params = DeconvolutionParams(method=method, exponent=exponent)
@@ -146,7 +146,7 @@ def document(rows: dict[str, Row]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _stages(restoration: Restoration) -> tuple[FloatArray, float, float]:
+def stages(restoration: Restoration) -> tuple[FloatArray, float, float]:
     """Return the filtered image, and the width and the exponent of the blur that was removed from it."""
     if restoration.filtered is None or restoration.deconvolution is None or restoration.posterior is None:
         raise RuntimeError("the whole chain did not run")

@@ -16,6 +16,9 @@ Results = dict[str, dict[str, Figures]]
 TURBRESTORE = "turbrestore"
 # Suffix of the figures of deblurred images.
 SAME = "_sharp"
+# Suffixes of a figure with the best blur removed, and of the width (pixels) and exponent of that blur; without the
+# figure they mean the blur that was removed.
+BEST, WIDTH, EXPONENT = "_best", "_width", "_exponent"
 # Readers, and the figures of what each reads.
 READ = {"tesseract": "words", "rapidocr": "words_rapidocr"}
 # Rounding of a figure; and what is less is no lead: dB, and shares of words.
@@ -74,7 +77,11 @@ def document(
         "## Beside a network\n",
         _network(results),
         "## Where another method is ahead\n",
-        "Each clip on which another method ends with more, and where its lead arises.\n",
+        "Each clip on which another method ends with more, and where its lead arises.  The blur of a merged image of "
+        f"others is estimated from that image alone, which is all that is left of it; {TURBRESTORE} also uses the "
+        "frames.  "
+        "The lead is taken apart by removing other widths from the filtered image of "
+        f"{TURBRESTORE}, a fifth apart, and where none is enough, Gaussians.\n",
         _leads(results),
     ]
     for heading, figure, digits in (
@@ -141,43 +148,69 @@ def _network(results: Results) -> str:
     return "\n".join(lines) + "\n"
 
 
+def leaders(results: Results, clip: str, figure: str) -> Figures:
+    """Figures of the methods that end with more on a clip than this project, the best first."""
+    own = results.get(TURBRESTORE, {}).get(clip, {})
+    others = {name: found.get(clip, {}).get(figure) for name, found in results.items() if name != TURBRESTORE}
+    ahead = {
+        name: value
+        for name, value in others.items()
+        if figure in own and value is not None and value > own[figure] + LEADS[figure]
+    }
+    return dict(sorted(ahead.items(), key=lambda item: -item[1]))
+
+
 def _leads(results: Results) -> str:
     """List of the clips on which a deblurred image of another method is better than that of this project."""
     lines = []
     for clip, own in results.get(TURBRESTORE, {}).items():
-        for figure, least in LEADS.items():
-            others = {
-                name: found[clip][figure]
-                for name, found in results.items()
-                if name != TURBRESTORE and figure in found.get(clip, {})
-            }
-            ahead = {name: value for name, value in others.items() if figure in own and value > own[figure] + least}
-            if ahead:
-                reader = next((name for name, read in READ.items() if figure == f"{read}{SAME}"), None)
-                unit = f" of the words by {reader}" if reader else " dB"
-                order = sorted(ahead, key=lambda one: -ahead[one])
-                said = ", ".join(f"{name} {ahead[name]:.2f}" for name in order)
-                why = _cause(order[0], results[order[0]][clip], own, figure)
-                lines.append(f"- {clip}: {said}; {TURBRESTORE} {own[figure]:.2f}{unit}. {why}\n")
+        for figure in LEADS:
+            if ahead := leaders(results, clip, figure):
+                said = ", ".join(f"{name} {value:.2f}" for name, value in ahead.items())
+                first = next(iter(ahead))
+                why = _cause(first, results[first][clip], own, figure)
+                lines.append(f"- {clip}: {said}; {TURBRESTORE} {own[figure]:.2f} {_unit(figure)}. {why}\n")
     return "".join(lines) or "On no clip.\n"
 
 
+def _unit(figure: str) -> str:
+    reader = next((name for name, read in READ.items() if figure == f"{read}{SAME}"), None)
+    return f"of the words by {reader}" if reader else "dB"
+
+
 def _cause(name: str, other: Figures, own: Figures, figure: str) -> str:
-    """Sentence on the stage in which a lead arises, from the figures before deblurring and at the mean geometry."""
-    merged, centroid = figure.removesuffix(SAME), f"centroid{SAME}"
+    """Sentence on the stage in which a lead arises: geometry, width, shape, or merging."""
+    centroid = f"centroid{SAME}"
     if figure.startswith("psnr") and centroid in own and own[centroid] >= other.get(centroid, np.inf):
         return f"At the mean geometry of the clip {TURBRESTORE} is ahead, so the scene is bent as a whole, not blurred."
+    best = own.get(figure + BEST)
+    if best is None:
+        return _merging(name, other, own, figure)
+    width, exponent = own[figure + WIDTH], own[figure + EXPONENT]
+    shape = "" if exponent == own[EXPONENT] else f", Gaussian in place of exponent {own[EXPONENT]:.2f},"
+    blur = f"{width:.2f} px{shape}" if width else "no blur"
+    if best <= own[figure] + EQUAL:
+        return f"Neither of the next widths helps. {_merging(name, other, own, figure)}"
+    reached = f"With {blur} removed in place of {own[WIDTH]:.2f} px it is {best:.2f}"
+    if best >= other[figure] - LEADS[figure]:
+        return f"{reached}, so the estimated {'width and shape are' if shape else 'width is'} at fault."
+    return f"{reached}. {_merging(name, other, own, figure)}"
+
+
+def _merging(name: str, other: Figures, own: Figures, figure: str) -> str:
+    """Sentence on who is ahead before deblurring."""
+    merged = figure.removesuffix(SAME)
     if merged not in own or merged not in other:
         return ""
     if other[merged] == other[figure]:
         return f"{name} sharpens as it merges, so that its stages cannot be told apart."
     less = own[merged] - other[merged]
     if abs(less) < EQUAL:
-        return f"Before deblurring {name} is neither ahead nor behind; its lead comes from the deblurring."
+        return f"Before deblurring {name} is neither ahead nor behind, so its lead comes from the deblurring."
     size = f"{abs(less):.2f} {'dB' if figure.startswith('psnr') else 'of the words'}"
     if less > 0:
-        return f"Before deblurring {name} is {size} behind, so its blur is removed better."
-    return f"Before deblurring {name} is {size} ahead already, so it merges the frames better."
+        return f"Before deblurring {name} is {size} behind, so its lead comes from the deblurring."
+    return f"Before deblurring {name} is {size} ahead already."
 
 
 def _videos(videos: Mapping[str, Results]) -> str:

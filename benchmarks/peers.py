@@ -26,6 +26,7 @@ from methods.low_rank import low_rank_image
 from methods.packages import NETWORK, PACKAGES, PackageError, make_environment, run_package
 from methods.sobolev import sobolev_latent_image
 from methods.usage import peak_megabytes, processor_seconds
+from peer_causes import add_best
 from peer_tables import READ, SAME, TURBRESTORE, Figures, Results, document
 from peer_videos import measure_videos
 from provenance import publish
@@ -141,6 +142,7 @@ def measure_all(patterns: list[str], methods: list[str], images: Path | None) ->
             method: {one: _figures(folder / f"{method}-{one}.npz", clips[one]) | used for one, used in found.items()}
             for method, found in spent.items()
         }
+        add_best(results, clips)
         if images is not None:
             _write_panels(images, folder, clips, [*results])
     return results, skipped

@@ -190,8 +190,9 @@ def document(results: Results, chosen: Sequence[str] = ()) -> str:
         *([f"Only some of the clips were measured: `--clips {shlex.join(chosen)}`.\n"] if chosen else []),
         "".join(f"- **{method}**: {meaning}.\n" for method, meaning in METHODS.items()),
         f"Clips called `smooth_…` ({COUNT} frames of {SMOOTH_SIDE}×{SMOOTH_SIDE}: smooth random flow, Gaussian blur of "
-        f"1 to 2 px, noise 0.01), `strong_…` (the same, displaced by {STRONG_RMS:g} px) and `screens_…` ({COUNT} "
-        f"frames of {SCREEN_SIDE}×{SCREEN_SIDE} through phase screens, weak, medium and strong: D/r0 1.2, 2.5 and 5) "
+        f"1 to 2 px, noise 0.01), `strong_…` and `stronger_…` (the same, displaced by {STRONG_RMS['strong']:g} and "
+        f"{STRONG_RMS['stronger']:g} px) and `screens_…` ({COUNT} frames of {SCREEN_SIDE}×{SCREEN_SIDE} through phase "
+        "screens, weak, medium and strong: D/r0 1.2, 2.5 and 5) "
         "are made on the spot.  The others come from the folder that "
         f"`TURBRESTORE_DATA` names; of real clips the first {MOST_FRAMES} frames and, where there is no text to read, "
         f"the middle {LARGEST_SIDE}×{LARGEST_SIDE} pixels are used.  Results are aligned with the truth once "
