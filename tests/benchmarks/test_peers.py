@@ -122,15 +122,15 @@ class TestDocument:
 
 def test_the_best_blur_is_found_where_another_method_is_ahead():
     made = make_sequence(6, 72, 72, "camera", rms=1.0)
-    clip = Clip(made.frames, made.image)
-    own = {name: {"psnr_sharp": compare(made.frames.mean(axis=0), made.image).psnr} for name in ("won", "lost")}
+    clip = Clip(made.frames, made.scene)
+    own = {name: {"psnr_sharp": compare(made.frames.mean(axis=0), made.scene).psnr} for name in ("won", "lost")}
     others = {"won": {"psnr_sharp": 0.0}, "lost": {"psnr_sharp": 99.0}}
     results = {"mean": others, "turbrestore": own}
     add_best(results, {"won": clip, "lost": clip})
     assert set(own["won"]) == {"psnr_sharp"}
     restoration = restore(made.frames)
     assert own["lost"]["_width"] == restoration.deconvolution.sigma
-    assert own["lost"]["psnr_sharp_best"] >= compare(restoration.image, made.image).psnr - 0.3
+    assert own["lost"]["psnr_sharp_best"] >= compare(restoration.image, made.scene).psnr - 0.3
 
 
 def test_videos_are_scored_frame_by_frame():
