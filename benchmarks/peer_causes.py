@@ -1,68 +1,82 @@
-"""What this project would have reached on a clip if it had removed the best blur: takes a lead of others apart."""
+"""What this project would have reached on a clip with another blur or another λ: takes a lead of others apart."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import sys
+from collections.abc import Iterator, Mapping
 
-from ablation import best_sigma, stages
+from ablation import SIGMAS, stages
 from clips import Clip
-from peer_tables import BEST, EXPONENT, LEADS, READ, SAME, TURBRESTORE, WIDTH, Figures, Results, leaders
+from peer_tables import LEADS, READ, SAME, TURBRESTORE, Results, Trial, Trials, leaders
 from words import share_read
 
 from turbrestore.blur.psf import GAUSSIAN
 from turbrestore.core.arrays import FloatArray
+from turbrestore.core.errors import TurbrestoreError
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
 from turbrestore.metrics import compare
-from turbrestore.pipeline import restore
+from turbrestore.pipeline import Restoration, restore
+from turbrestore.registration.recentring import recentre
+
+# Widths from half to twice the one that is removed are tried; these where none is removed.
+SMALL = SIGMAS[:9]
+# λ is multiplied by these.
+FACTORS = (0.5, 2.0)
 
 
-def add_best(results: Results, clips: dict[str, Clip]) -> None:
-    """Add to the figures of this project what the best width gives, on the clips on which another method is ahead."""
-    found = results.get(TURBRESTORE, {})
-    for name in found:
+def try_others(results: Results, clips: Mapping[str, Clip]) -> Trials:
+    """Find what other settings give where another method is ahead."""
+    found: Trials = {}
+    for name in results.get(TURBRESTORE, {}):
         lost = {figure: max(ahead.values()) for figure in LEADS if (ahead := leaders(results, name, figure))}
-        if lost:
-            found[name] |= at_best_blur(clips[name], lost)
-
-
-def at_best_blur(clip: Clip, lost: dict[str, float]) -> Figures:
-    """Width and exponent that are removed, and for each figure those that are best, and the figure with them.
-
-    ``lost`` has the figures of the leading methods.  A Gaussian is tried where no width of the present shape is enough.
-    """
-    restoration = restore(clip.frames)
-    if restoration.deconvolution is None or restoration.posterior is None:
-        return {}
-    filtered, removed, exponent = stages(restoration)
-    found: Figures = {WIDTH: removed, EXPONENT: exponent}
-    for figure, wanted in lost.items():
-        trials = _trials(filtered, restoration.centroid.image, clip, figure, removed, (exponent, GAUSSIAN), wanted)
-        best, width, shape = max(trials)
-        found |= {figure + BEST: round(best, 4), figure + WIDTH: width, figure + EXPONENT: shape}
+        if not lost:
+            continue
+        try:
+            restoration = restore(clips[name].frames)
+            for figure, wanted in lost.items():
+                if trials := tried(restoration, clips[name], figure, wanted):
+                    found[name, figure] = trials
+        except TurbrestoreError as error:
+            print(f"{name} is not taken apart: {error}", file=sys.stderr)
     return found
 
 
-def _trials(
-    filtered: FloatArray,
-    guide: FloatArray,
-    clip: Clip,
-    figure: str,
-    start: float,
-    exponents: Iterable[float],
-    wanted: float,
-) -> list[tuple[float, float, float]]:
-    """Figure, width and exponent of the best widths of each shape, until the wanted figure is reached."""
-    trials: list[tuple[float, float, float]] = []
-    for exponent in exponents:
-        params = DeconvolutionParams(exponent=exponent)
-        width, best = best_sigma(
-            lambda sigma, params=params: _score(deconvolve(filtered, sigma, params, guide=guide).image, clip, figure),
-            start,
-        )
-        trials.append((best, width, exponent))
-        if best >= wanted - LEADS[figure]:
+def tried(restoration: Restoration, clip: Clip, figure: str, wanted: float) -> list[Trial]:
+    """Figures with other widths, and where those are not enough, with a Gaussian and with another λ.
+
+    Nothing where no blur was looked for.  The first trial is what was removed, on the same way.
+    """
+    if restoration.deconvolution is None or restoration.posterior is None or restoration.filtered is None:
+        return []
+    filtered, removed, exponent = stages(restoration)
+    guide = recentre(restoration.centroid.image, restoration.filtered.mean_flow)
+
+    def attempt(width: float, shape: float, factor: float = 1.0) -> Trial:
+        params = DeconvolutionParams(exponent=shape)
+        if factor != 1:
+            usual = deconvolve(filtered, width, params, guide, noise=restoration.noise).fidelity
+            params = DeconvolutionParams(exponent=shape, fidelity=factor * usual)
+        image = deconvolve(filtered, width, params, guide, noise=restoration.noise).image
+        return Trial(_score(image, clip, figure), width, shape, factor)
+
+    def rounds() -> Iterator[list[Trial]]:
+        yield [attempt(removed, exponent), *(attempt(width, exponent) for width in _widths(removed))]
+        if figure.startswith("psnr"):
+            yield [attempt(width, GAUSSIAN) for width in _widths(removed)]
+        best = max(trials, key=lambda trial: trial.figure)
+        yield [attempt(best.width, best.exponent, factor) for factor in FACTORS if best.width]
+
+    trials: list[Trial] = []
+    for some in rounds():
+        trials += some
+        if max(trial.figure for trial in trials) >= wanted - LEADS[figure]:
             break
     return trials
+
+
+def _widths(removed: float) -> list[float]:
+    near = [width for width in SIGMAS if removed / 2 <= width <= 2 * removed] if removed else SMALL
+    return [0.0, *(width for width in near if width)]
 
 
 def _score(image: FloatArray, clip: Clip, figure: str) -> float:

@@ -4,21 +4,31 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from clips import is_reported
 from methods.packages import NETWORK
 
+
+class Trial(NamedTuple):
+    """A figure with a blur of this width (pixels) and exponent removed, and λ times a factor."""
+
+    figure: float
+    width: float
+    exponent: float
+    factor: float = 1.0
+
+
 Figures = dict[str, float]
 # Method, clip, figure.
 Results = dict[str, dict[str, Figures]]
+# By clip and figure; the first is what is removed by default.
+Trials = dict[tuple[str, str], list[Trial]]
 
 TURBRESTORE = "turbrestore"
 # Suffix of the figures of deblurred images.
 SAME = "_sharp"
-# Suffixes of a figure with the best blur removed, and of the width (pixels) and exponent of that blur; without the
-# figure they mean the blur that was removed.
-BEST, WIDTH, EXPONENT = "_best", "_width", "_exponent"
 # Readers, and the figures of what each reads.
 READ = {"tesseract": "words", "rapidocr": "words_rapidocr"}
 # Rounding of a figure; and what is less is no lead: dB, and shares of words.
@@ -46,8 +56,12 @@ def document(
     skipped: Mapping[str, str],
     videos: Mapping[str, Results],
     chosen: Sequence[str] = (),
+    trials: Trials | None = None,
 ) -> str:
-    """Markdown of everything that was measured; ``chosen`` are the clips that were asked for, all if it is empty."""
+    """Markdown of everything that was measured; ``chosen`` are the clips that were asked for, all if it is empty.
+
+    ``trials`` say what other settings give where another method is ahead.
+    """
     parts = [
         "# Beside other methods\n",
         "What `TURBRESTORE_DATA=DIR python benchmarks/peers.py --write benchmarks/results/peers.md` measures: the same "
@@ -78,11 +92,11 @@ def document(
         _network(results),
         "## Where another method is ahead\n",
         "Each clip on which another method ends with more, and where its lead arises.  The blur of a merged image of "
-        f"others is estimated from that image alone, which is all that is left of it; {TURBRESTORE} also uses the "
-        "frames.  "
-        "The lead is taken apart by removing other widths from the filtered image of "
-        f"{TURBRESTORE}, a fifth apart, and where none is enough, Gaussians.\n",
-        _leads(results),
+        f"others is estimated from that image alone; {TURBRESTORE} also uses the frames.  Each lead is taken apart by "
+        f"removing other widths from the merged image of {TURBRESTORE}, from half to twice the one that it has "
+        "removed; where that is not enough, a Gaussian in place of the estimated shape, and half or twice the weight "
+        "λ of the data.\n",
+        _leads(results, trials or {}),
     ]
     for heading, figure, digits in (
         ("PSNR of the merged images, dB", "psnr", 2),
@@ -160,7 +174,7 @@ def leaders(results: Results, clip: str, figure: str) -> Figures:
     return dict(sorted(ahead.items(), key=lambda item: -item[1]))
 
 
-def _leads(results: Results) -> str:
+def _leads(results: Results, trials: Trials) -> str:
     """List of the clips on which a deblurred image of another method is better than that of this project."""
     lines = []
     for clip, own in results.get(TURBRESTORE, {}).items():
@@ -168,7 +182,7 @@ def _leads(results: Results) -> str:
             if ahead := leaders(results, clip, figure):
                 said = ", ".join(f"{name} {value:.2f}" for name, value in ahead.items())
                 first = next(iter(ahead))
-                why = _cause(first, results[first][clip], own, figure)
+                why = _cause(first, results[first][clip], own, figure, trials.get((clip, figure), []))
                 lines.append(f"- {clip}: {said}; {TURBRESTORE} {own[figure]:.2f} {_unit(figure)}. {why}\n")
     return "".join(lines) or "On no clip.\n"
 
@@ -178,23 +192,25 @@ def _unit(figure: str) -> str:
     return f"of the words by {reader}" if reader else "dB"
 
 
-def _cause(name: str, other: Figures, own: Figures, figure: str) -> str:
-    """Sentence on the stage in which a lead arises: geometry, width, shape, or merging."""
+def _cause(name: str, other: Figures, own: Figures, figure: str, trials: Sequence[Trial]) -> str:
+    """Sentence on the stage in which a lead arises: geometry, width, shape, λ, or merging."""
     centroid = f"centroid{SAME}"
     if figure.startswith("psnr") and centroid in own and own[centroid] >= other.get(centroid, np.inf):
         return f"At the mean geometry of the clip {TURBRESTORE} is ahead, so the scene is bent as a whole, not blurred."
-    best = own.get(figure + BEST)
-    if best is None:
+    if not trials:
         return _merging(name, other, own, figure)
-    width, exponent = own[figure + WIDTH], own[figure + EXPONENT]
-    shape = "" if exponent == own[EXPONENT] else f", Gaussian in place of exponent {own[EXPONENT]:.2f},"
-    blur = f"{width:.2f} px{shape}" if width else "no blur"
-    if best <= own[figure] + EQUAL:
-        return f"Neither of the next widths helps. {_merging(name, other, own, figure)}"
-    reached = f"With {blur} removed in place of {own[WIDTH]:.2f} px it is {best:.2f}"
-    if best >= other[figure] - LEADS[figure]:
-        return f"{reached}, so the estimated {'width and shape are' if shape else 'width is'} at fault."
-    return f"{reached}. {_merging(name, other, own, figure)}"
+    removed, best = trials[0], max(trials, key=lambda trial: trial.figure)
+    if best.figure <= removed.figure + LEADS[figure]:
+        return f"No blur that was tried gives more. {_merging(name, other, own, figure)}"
+    changed = [f"{best.width:.2f} px" if best.width else "no blur", f"in place of {removed.width:.2f} px"]
+    if best.width and best.exponent != removed.exponent:
+        changed.append(f"as a Gaussian in place of an exponent of {removed.exponent:.2f}")
+    if best.factor != 1:
+        changed.append(f"with {'half' if best.factor < 1 else 'twice'} the λ")
+    reached = f"By removing {' '.join(changed)} it has {best.figure:.2f}"
+    if best.figure >= other[figure] - LEADS[figure]:
+        return f"{reached}: its merged image is good enough."
+    return f"{reached}, and by no blur that was tried more. {_merging(name, other, own, figure)}"
 
 
 def _merging(name: str, other: Figures, own: Figures, figure: str) -> str:
@@ -206,11 +222,9 @@ def _merging(name: str, other: Figures, own: Figures, figure: str) -> str:
         return f"{name} sharpens as it merges, so that its stages cannot be told apart."
     less = own[merged] - other[merged]
     if abs(less) < EQUAL:
-        return f"Before deblurring {name} is neither ahead nor behind, so its lead comes from the deblurring."
+        return f"Before deblurring {name} is neither ahead nor behind."
     size = f"{abs(less):.2f} {'dB' if figure.startswith('psnr') else 'of the words'}"
-    if less > 0:
-        return f"Before deblurring {name} is {size} behind, so its lead comes from the deblurring."
-    return f"Before deblurring {name} is {size} ahead already."
+    return f"Before deblurring {name} is {size} {'behind' if less > 0 else 'ahead already'}."
 
 
 def _videos(videos: Mapping[str, Results]) -> str:

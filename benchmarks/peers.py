@@ -26,8 +26,8 @@ from methods.low_rank import low_rank_image
 from methods.packages import NETWORK, PACKAGES, PackageError, make_environment, run_package
 from methods.sobolev import sobolev_latent_image
 from methods.usage import peak_megabytes, processor_seconds
-from peer_causes import add_best
-from peer_tables import READ, SAME, TURBRESTORE, Figures, Results, document
+from peer_causes import try_others
+from peer_tables import READ, SAME, TURBRESTORE, Figures, Results, Trials, document
 from peer_videos import measure_videos
 from provenance import publish
 from quality import panel
@@ -97,13 +97,13 @@ def main() -> int:
     options = _options()
     try:
         chosen = [name for name in MEANINGS if any(fnmatch(name, pattern) for pattern in options.methods)]
-        results, skipped = measure_all(options.clips, chosen, options.images)
+        results, skipped, trials = measure_all(options.clips, chosen, options.images)
         networks = {NETWORK: PACKAGES[NETWORK].python} if results.get(NETWORK) else {}
         videos = {} if options.without_videos else measure_videos(networks)
     except TurbrestoreError as error:
         print(f"peers: {error}", file=sys.stderr)
         return error.exit_code
-    text = document(results, {name: MEANINGS[name] for name in chosen}, skipped, videos, options.clips)
+    text = document(results, {name: MEANINGS[name] for name in chosen}, skipped, videos, options.clips, trials)
     publish(text, options.write)
     if options.json is not None:
         figures = {"clips": results, "videos": videos, "skipped": skipped}
@@ -111,8 +111,8 @@ def main() -> int:
     return 0
 
 
-def measure_all(patterns: list[str], methods: list[str], images: Path | None) -> tuple[Results, dict[str, str]]:
-    """Figures of every method and clip, and why methods are missing."""
+def measure_all(patterns: list[str], methods: list[str], images: Path | None) -> tuple[Results, dict[str, str], Trials]:
+    """Figures of every method and clip, why methods are missing, and what other settings give."""
     clips = {name: load() for name, load in find_clips(patterns).items()}
     # Without a truth or words there is nothing to compare.
     clips = {name: clip for name, clip in clips.items() if clip.truth is not None or (clip.words and can_read())}
@@ -142,10 +142,10 @@ def measure_all(patterns: list[str], methods: list[str], images: Path | None) ->
             method: {one: _figures(folder / f"{method}-{one}.npz", clips[one]) | used for one, used in found.items()}
             for method, found in spent.items()
         }
-        add_best(results, clips)
+        trials = try_others(results, clips)
         if images is not None:
             _write_panels(images, folder, clips, [*results])
-    return results, skipped
+    return results, skipped, trials
 
 
 def run_child(task: dict[str, Any]) -> dict[str, Any]:

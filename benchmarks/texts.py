@@ -132,14 +132,12 @@ def limits() -> str:
     least, most = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
     base, noisy = one["base"], one["noise 0.05"]
     return (
-        f"- **More frames** remove noise and bent lines: {many} in place of {few.split()[0]} gain "
-        f"{gain(end, SCENE, start, SCENE):.1f} dB against the scene, but only "
-        f"{gain(end, 'product', start, 'product'):.1f} dB against the scene at the mean geometry of the frames, "
-        "because the blur stays.\n"
-        f"- **A camera with a fifth of the noise** gains {gain(base, 'product', noisy, 'product'):.1f} dB: *base* has "
-        "noise of 0.01.\n"
-        f"- **A blur that is known** gains {gain(base, 'true blur', base, 'product'):.1f} dB in *base*, and "
-        f"{sum(known.values()) / len(known):.1f} dB on average over the simulators: {known[most]:+.1f} dB for "
+        f"- **More frames** take noise and bends out, not blur: {many} in place of {few.split()[0]} change the PSNR by "
+        f"{gain(end, SCENE, start, SCENE):+.1f} dB against the scene, and by "
+        f"{gain(end, 'product', start, 'product'):+.1f} dB against the scene at the mean geometry of the frames.\n"
+        f"- **A camera with a fifth of the noise** changes it by {gain(base, 'product', noisy, 'product'):+.1f} dB.\n"
+        f"- **A blur that is known** changes it by {gain(base, 'true blur', base, 'product'):+.1f} dB for *base*, and "
+        f"by {sum(known.values()) / len(known):+.1f} dB on average over the simulators: {known[most]:+.1f} dB for "
         f"*{most}*, {known[least]:+.1f} dB for *{least}*.\n"
     )
 

@@ -33,7 +33,7 @@ class TestDrawnClips:
 
     def test_no_other_clip_shows_their_scenes(self):
         shown = {
-            name.split("_")[-1] for name in clips.find_clips() if name.startswith(("smooth_", "strong_", "screens_"))
+            name.split("_")[-1] for name in clips.find_clips() if name.startswith(("smooth_", "strong", "screens_"))
         }
         assert not shown & set(clips.DRAWN_SCENES)
         assert not set(clips.DRAWN_SCENES) & set(blur_clips.CHOSEN)
