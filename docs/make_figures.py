@@ -4,7 +4,7 @@ Run ``python docs/make_figures.py``; names of groups (``film``, ``gallery``, ``s
 only these.
 
 The photographs come with scikit-image and are in the public domain or under CC0: the photographer by Lav Varshney, the
-cat by Stefan van der Walt, brick and gravel from CC0Textures.  What else is shown is drawn by
+cat by Stefan van der Walt, the gravel from CC0Textures.  What else is shown is drawn by
 ``turbrestore.synthesis.drawn_scenes`` and ``turbrestore.synthesis.scenes``.
 """
 

@@ -142,3 +142,20 @@ def test_a_script_that_prints_its_table_stores_it_below_its_heading(tmp_path, mo
     assert provenance.publish_printed("# T", lambda: 3 * bool(sys.stdout.write("| 1 |\n"))) == 3
     assert capsys.readouterr().out == "| 1 |\n"
     assert LINE.sub("", (tmp_path / "t.md").read_text()) == "# T\n\n| 1 |\n"
+
+
+def test_what_would_help_is_read_from_the_right_cells(tmp_path, monkeypatch):
+    head = "| clip | mean | product | true flow | true blur | against the scene |\n|---|---:|---:|---:|---:|---:|\n"
+    (tmp_path / "oracles.md").write_text(
+        f"# T\n\n## One thing made worse at a time\n\n{head}| base | 1 | 20.00 | 1 | 22.50 | 1 |\n"
+        f"| noise 0.05 | 1 | 19.25 | 1 | 1 | 1 |\n\n## More frames\n\n{head}| 8 frames | 1 | 10.00 | 1 | 1 | 5.00 |\n"
+        f"| 30 frames | 9 | 9 | 9 | 9 | 9 |\n| 120 frames | 1 | 10.40 | 1 | 1 | 11.00 |\n\n"
+        f"## Other air and other cameras\n\n{head}| here | 1 | 10.00 | 1 | 13.00 | 1 |\n"
+        f"| there | 1 | 10 | 1 | 9.00 | 1 |\n"
+    )
+    monkeypatch.setattr(texts, "RESULTS", tmp_path)
+    more, noise, blur = texts.limits().splitlines()
+    assert "120 frames in place of 8" in more and "+6.0 dB against the scene, and by +0.4 dB" in more
+    assert "+0.8 dB" in noise
+    assert "+2.5 dB for *base*" in blur and "+1.0 dB on average" in blur
+    assert "+3.0 dB for *here*, -1.0 dB for *there*" in blur
