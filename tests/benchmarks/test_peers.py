@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -196,3 +197,12 @@ def test_the_script_prints_and_writes_its_document(tmp_path, monkeypatch, capsys
     assert peers.main() == 0
     assert "Only some of the clips were measured: `--clips 'smooth_*' tiny`." in capsys.readouterr().out
     assert json.loads((tmp_path / "f.json").read_text())["clips"] == figures
+
+
+def test_all_methods_are_measured_and_leads_taken_apart(clip, tmp_path, monkeypatch):
+    monkeypatch.setattr(peers, "find_clips", lambda _: {"tiny": lambda: replace(clip, words=())})
+    monkeypatch.setattr(peers, "try_others", lambda results, clips: (sorted(results), [*clips]))
+    results, skipped, trials = peers.measure_all([], ["mean", "turbrestore"], tmp_path)
+    assert trials == (["mean", "turbrestore"], ["tiny"]) and not skipped
+    assert results["turbrestore"]["tiny"]["psnr"] > results["mean"]["tiny"]["psnr"] > 10
+    assert (tmp_path / "tiny.png").exists()
