@@ -67,6 +67,7 @@ TABLES = {
     "smooth_noise": Table("smooth_noise.py"),
     "blur": Table("blur.py"),
     "registration": Table("registration.py"),
+    "memory": Table("memory.py --quick"),
     "steady": Table("steady.py reported"),
     "stacking": Table("stacking.py"),
     "verdicts": Table("verdicts.py"),
@@ -77,7 +78,6 @@ TABLES = {
     "speed": Table("speed.py --before 546a653", timed=True),
     "history": Table("history.py", timed=True),
     "tvl1": Table("tvl1.py --quick", timed=True),
-    "memory": Table("memory.py --quick", timed=True),
     "device": Table("device.py --device cuda --size 1080 1920 --frames 100 --runs 1", timed=True, missing=_gpu),
 }
 

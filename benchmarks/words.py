@@ -43,7 +43,7 @@ def missing(reader: str) -> str:
     """Why a reader cannot read, empty where it can."""
     if reader == "tesseract":
         return "" if shutil.which("tesseract") else "tesseract is not installed"
-    return "" if NETWORKS.python.exists() else f"{NETWORKS.folder.name}, the environment of RapidOCR, has not been made"
+    return "" if NETWORKS.made.exists() else f"{NETWORKS.folder.name}, the environment of RapidOCR, has not been made"
 
 
 def can_read(reader: str = "tesseract") -> bool:

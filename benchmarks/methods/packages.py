@@ -35,6 +35,11 @@ class Environment:
         """Its interpreter."""
         return self.folder / "bin" / "python"
 
+    @property
+    def made(self) -> Path:
+        """File that is there once the folder is filled: what was killed on the way does not pass for whole."""
+        return self.folder / "made"
+
 
 STACKERS = Environment(
     ROOT / ".venv-peers",
@@ -66,16 +71,14 @@ def make_environment(environment: Environment) -> Path:
         It cannot be made, for example without a network.
     """
     folder, python = environment.folder, environment.python
-    if python.exists():
+    if environment.made.exists():
         return python
     try:
-        venv.create(folder, with_pip=True)
+        venv.create(folder, clear=True, with_pip=True)
         for call in environment.calls:
             _check([str(python), "-m", "pip", "--quiet", *call.split()], folder)
+        environment.made.touch()
     except (OSError, subprocess.SubprocessError, PackageError) as error:
-        # A half-made environment would pass for a whole one.
-        if python.is_file():
-            python.unlink()
         raise PackageError(f"{folder}: the environment cannot be made: {error}") from None
     return python
 

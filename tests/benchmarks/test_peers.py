@@ -10,7 +10,8 @@ import peer_causes
 import peers
 import pytest
 from clips import Clip
-from methods.packages import NETWORK, PackageError, run_package
+from methods import packages
+from methods.packages import NETWORK, PackageError, make_environment, run_package
 from peer_causes import tried, try_others
 from peer_tables import Trial, document
 from peer_videos import moving_square, score_video
@@ -206,3 +207,26 @@ def test_all_methods_are_measured_and_leads_taken_apart(clip, tmp_path, monkeypa
     assert trials == (["mean", "turbrestore"], ["tiny"]) and not skipped
     assert results["turbrestore"]["tiny"]["psnr"] > results["mean"]["tiny"]["psnr"] > 10
     assert (tmp_path / "tiny.png").exists()
+
+
+def test_a_method_that_fails_on_every_clip_spoils_no_mean(clip, monkeypatch):
+    monkeypatch.setattr(peers, "find_clips", lambda _: {"tiny": lambda: replace(clip, words=())})
+    monkeypatch.setattr(peers, "make_environment", lambda _: Path("none"))
+    monkeypatch.setattr(peers, "child", lambda _, task: {"clips": {}, "failed": {"tiny": "it broke"}})
+    results, skipped, _ = peers.measure_all([], ["pystackreg"], None)
+    assert results == {} and skipped == {"pystackreg": "it broke"}
+
+
+def test_an_environment_that_was_not_finished_is_made_again(tmp_path, monkeypatch):
+    begun = []
+    monkeypatch.setattr(packages.venv, "create", lambda folder, **_: begun.append(folder.mkdir(exist_ok=True)))
+    monkeypatch.setattr(packages, "_check", lambda command, _: fail() if len(begun) == 1 else "")
+
+    def fail():
+        raise KeyboardInterrupt
+
+    environment = packages.Environment(tmp_path / "env", ("install nothing",))
+    with pytest.raises(KeyboardInterrupt):
+        make_environment(environment)
+    assert make_environment(environment) == make_environment(environment) == environment.python
+    assert len(begun) == 2
