@@ -75,9 +75,9 @@ def make_film() -> None:
 
 
 def make_gallery() -> None:
-    """Frame, temporal mean, result and truth of every scene, and their PSNR."""
-    print("| scene | frame, dB | temporal mean, dB | restored, dB |\n|---|---:|---:|---:|")
-    for name in GALLERY:
+    """Frame, temporal mean, result and truth of every scene, and the table of their PSNR in gallery.md."""
+    rows = []
+    for name, (_, strength, count, noise) in GALLERY.items():
         shown = gallery_clip(name)
         panels = {
             "frame": shown.frame,
@@ -86,8 +86,13 @@ def make_gallery() -> None:
             "truth": shown.truth,
         }
         figures = [tr.compare(image, shown.truth).psnr for image in list(panels.values())[:3]]
-        print(f"| {name} | " + " | ".join(f"{value:.1f}" for value in figures) + " |", flush=True)
+        air = f"{strength}, noisy" if noise > 0.01 else strength
+        rows.append(f"| {name} | {air} | {count} | {' | '.join(f'{value:.1f}' for value in figures)} |\n")
+        print(rows[-1], end="", flush=True)
         save(f"gallery_{name}", row(panels), LARGEST_ROW)
+    page = Path(__file__).with_name("gallery.md")
+    table = re.compile(r"(?<=\|---\|---\|---:\|---:\|---:\|---:\|\n)(?:\|.*\n)+")
+    page.write_text(table.sub("".join(rows), page.read_text("utf-8")), "utf-8")
 
 
 def make_stages() -> None:
