@@ -106,6 +106,8 @@ def behind_lens(case: Case, rng: np.random.Generator) -> tuple[FloatArray, Float
     params = SmoothFlowParams(rms=1.5, correlation_length=12.0)
     still = np.zeros((count, *scene.shape, 2), np.float32)
     flows = smooth_flows(count, *scene.shape, rng, params) if case.kind == "lens" else still
+    # The scene is the mean geometry of the frames, which is all that they can tell.
+    flows -= flows.mean(axis=0)
     frames = []
     for flow in flows:
         frame = warp(scene, flow)

@@ -18,6 +18,7 @@ from provenance import LINE, outdated, revision, with_origin
 
 import turbrestore
 from turbrestore.io.images.image_files import read_image
+from turbrestore.registration.flow import estimate_flow
 from turbrestore.registration.warp import warp
 
 
@@ -30,6 +31,12 @@ class TestDrawnClips:
         # The truth is the scene in the geometry of the frames: their mean lies about it.
         errors = [np.abs(one.frames.mean(axis=0) - truth).mean() for truth in (one.truth, other.truth)]
         assert errors[0] < 0.5 * errors[1]
+
+    def test_the_truth_behind_a_lens_lies_at_the_mean_geometry_of_the_frames(self):
+        for name, seed in (("grass", 1), ("coins", 2)):
+            frames, truth = blur_clips.behind_lens(blur_clips.Case("t", name, "lens", 0.0), np.random.default_rng(seed))
+            found = estimate_flow(truth, frames).mean(axis=0)[20:-20, 20:-20]
+            assert np.median(np.abs(found)) < 0.1
 
     def test_no_other_clip_shows_their_scenes(self):
         shown = {
