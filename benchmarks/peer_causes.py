@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 
 from ablation import SIGMAS, stages
 from clips import Clip
-from peer_tables import LEADS, READ, SAME, TURBRESTORE, Results, Trial, Trials, leaders
+from peer_tables import LEADS, TURBRESTORE, Results, Trial, Trials, leaders, reader_of
 from words import share_read
 
 from turbrestore.blur.psf import GAUSSIAN
@@ -80,7 +80,7 @@ def _widths(removed: float) -> list[float]:
 
 
 def _score(image: FloatArray, clip: Clip, figure: str) -> float:
-    reader = next((name for name, read in READ.items() if figure == f"{read}{SAME}"), None)
+    reader = reader_of(figure)
     if reader:
         return share_read(image, clip.words, reader)
     assert clip.truth is not None

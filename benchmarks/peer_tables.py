@@ -187,8 +187,13 @@ def _leads(results: Results, trials: Trials) -> str:
     return "".join(lines) or "On no clip.\n"
 
 
+def reader_of(figure: str) -> str | None:
+    """Reader that tells a figure of deblurred images, None where it is no share of words."""
+    return next((name for name, read in READ.items() if figure == f"{read}{SAME}"), None)
+
+
 def _unit(figure: str) -> str:
-    reader = next((name for name, read in READ.items() if figure == f"{read}{SAME}"), None)
+    reader = reader_of(figure)
     return f"of the words by {reader}" if reader else "dB"
 
 
