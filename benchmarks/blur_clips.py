@@ -98,7 +98,7 @@ def behind_air(case: Case, rng: np.random.Generator, codec: bool = True) -> tupl
 
 
 def behind_lens(case: Case, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Frames of a photograph behind a Gaussian lens, which smooth flows move by 1.5 px or not at all."""
+    """Frames of a photograph behind a Gaussian lens, which smooth flows move by 1.3 px or not at all."""
     height, width = LENS
     count, noise = (30, 0.008) if case.kind == "lens" else (24, 0.004)
     scene = part_of(case.scene, (height + 100, width + 96), rng, 512)
@@ -106,11 +106,12 @@ def behind_lens(case: Case, rng: np.random.Generator) -> tuple[FloatArray, Float
     params = SmoothFlowParams(rms=1.5, correlation_length=12.0)
     still = np.zeros((count, *scene.shape, 2), np.float32)
     flows = smooth_flows(count, *scene.shape, rng, params) if case.kind == "lens" else still
-    # The scene is the mean geometry of the frames, which is all that they can tell.
+    # The flows from the scene to the frames are zero on average: the scene lies at the mean geometry, which is all that
+    # the frames can tell.
     flows -= flows.mean(axis=0)
     frames = []
     for flow in flows:
-        frame = warp(scene, flow)
+        frame = warp(scene, invert_flow(flow))
         frame = cv2.GaussianBlur(frame, (0, 0), case.number) if case.number else frame
         frames.append(frame[inner] + noise * rng.standard_normal((height, width)))
     return np.array(frames, np.float32), scene[inner].copy()

@@ -86,7 +86,8 @@ def document(
         _means(results, is_reported),
         "## Means over the other clips\n",
         "Settings were chosen on some of these.  PSNR and SSIM are over the clips with known truth, words over those "
-        f"with text.  {NETWORK} ran on some of them only.\n",
+        f"with text, each without the clips on which a method gave no result; {NETWORK}, which ran on some only, does "
+        "not count here.\n",
         _means(results, lambda clip: not is_reported(clip)),
         "## Beside a network\n",
         _network(results),
@@ -94,8 +95,8 @@ def document(
         "Each clip on which another method ends with more, and where its lead arises.  The blur of a merged image of "
         f"others is estimated from that image alone; {TURBRESTORE} also uses the frames.  Each lead is taken apart by "
         f"removing other widths from the merged image of {TURBRESTORE}, from half to twice the one that it has "
-        "removed; where that is not enough, a Gaussian in place of the estimated shape, and half or twice the weight "
-        "λ of the data.\n",
+        "removed; where that is not enough, for PSNR a Gaussian in place of the estimated shape, and then half and "
+        "twice the weight λ of the data at the best width.\n",
         _leads(results, trials or {}),
     ]
     for heading, figure, digits in (
@@ -122,7 +123,7 @@ def _means(results: Results, chosen: Callable[[str], bool]) -> str:
     for method, clips in results.items():
         cells = []
         for _, figure, digits in COLUMNS:
-            others = [found for name, found in results.items() if name != NETWORK]
+            others = [found for name, found in results.items() if name != NETWORK and any(map(chosen, found))]
             names = filter(chosen, dict.fromkeys(clip for found in others for clip in found))
             common = [clip for clip in names if all(figure in found.get(clip, {}) for found in others)]
             values = [clips[clip][figure] for clip in common if figure in clips.get(clip, {})]
