@@ -92,24 +92,30 @@ def restore(path: Path, tree: Path | None) -> tuple[FloatArray, float, float]:
 
 def document(releases: list[Release], mean: float) -> str:
     """Markdown table."""
-    count, first = len(releases[0].psnr), releases[0]
+    count = len(releases[0].psnr)
     lines = [
         "# Releases",
         "",
         f"Made by `python benchmarks/history.py`: {count} drawn clips, restored by the command of each release with",
         f"its defaults on one machine. The mean of the frames has {mean:.2f} dB. Time, start included, and peak",
-        "memory are means over the clips.",
+        "memory are means over the clips. A gain stands with its standard error and the least of one clip.",
         "",
-        "| release | mean PSNR, dB | least gain over 0.1.0, dB | time, s | memory, MB | lines of the package |",
-        "|---|---|---|---|---|---|",
+        "| release | mean PSNR, dB | gain over the last, dB | least gain, dB | time, s | memory, MB | package, lines |",
+        "|---|---|---|---|---|---|---|",
     ]
-    for release in releases:
-        least = min(now - was for now, was in zip(release.psnr, first.psnr, strict=True))
+    for before, release in zip([None, *releases], releases, strict=False):
+        gain, least = _gain(release.psnr, before.psnr) if before else ("–", "–")
         lines.append(
-            f"| {release.name} | {np.mean(release.psnr):.2f} | {least:+.2f} | {np.mean(release.seconds):.1f} | "
+            f"| {release.name} | {np.mean(release.psnr):.2f} | {gain} | {least} | {np.mean(release.seconds):.1f} | "
             f"{np.mean(release.memory):.0f} | {release.lines:,} |"
         )
     return "\n".join([*lines, "", "![The same as a figure](history.png)"]) + "\n"
+
+
+def _gain(now: tuple[float, ...], before: tuple[float, ...]) -> tuple[str, str]:
+    """Mean difference with its standard error, and the least."""
+    gains = np.subtract(now, before)
+    return f"{gains.mean():+.2f} ± {gains.std(ddof=1) / np.sqrt(gains.size):.2f}", f"{gains.min():+.2f}"
 
 
 def draw(releases: list[Release], mean: float, path: Path) -> None:

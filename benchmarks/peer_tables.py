@@ -136,7 +136,6 @@ def _means(results: Results, chosen: Callable[[str], bool]) -> str:
 
 NETWORK_COLUMNS = (
     ("PSNR, dB", f"psnr{SAME}", 2),
-    ("at the mean geometry", f"centroid{SAME}", 2),
     ("Tesseract", f"words{SAME}", 2),
     ("RapidOCR", f"words_rapidocr{SAME}", 2),
     ("s", "seconds", 0),

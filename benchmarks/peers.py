@@ -46,8 +46,8 @@ from turbrestore.runtime.steps import finish
 
 # Share of the frames that a lucky average keeps: as the stacker does here.
 LUCKY = 0.5
-# The network takes minutes for a clip, so it sees those that are drawn, one with a known mean geometry, and text.
-NETWORK_CLIPS = ("drawn_*", "ao_camera_medium", "turbtext_pg*")
+# The network takes minutes for a clip, so it sees those that are drawn, and text.
+NETWORK_CLIPS = ("drawn_*", "turbtext_pg*")
 # What is compiled and loaded once does not count.
 WARM = np.s_[:6, :64, :64]
 

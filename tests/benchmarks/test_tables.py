@@ -6,6 +6,7 @@ import all as everything
 import blur_clips
 import clips
 import cv2
+import history
 import numpy as np
 import oracles
 import provenance
@@ -38,6 +39,16 @@ class TestDrawnClips:
             found = estimate_flow(truth, frames).mean(axis=0)[20:-20, 20:-20]
             assert np.median(np.abs(found)) < 0.06
 
+    def test_frames_behind_a_perfect_lens_are_as_fine_as_the_scene(self):
+        def detail(image):
+            return np.square(cv2.Laplacian(np.float32(image), cv2.CV_32F)[20:-20, 20:-20]).mean()
+
+        for name, seed in (("grass", 1), ("coins", 2)):
+            frames, truth = blur_clips.behind_lens(blur_clips.Case("t", name, "lens", 0.0), np.random.default_rng(seed))
+            # Noise of deviation 0.008 has a Laplacian of 20 times its variance.
+            found = np.mean([detail(frame) for frame in frames]) - 20 * 0.008**2
+            assert 0.9 < found / detail(truth) < 1.1
+
     def test_no_other_clip_shows_their_scenes(self):
         shown = {
             name.split("_")[-1] for name in clips.find_clips() if name.startswith(("smooth_", "strong", "screens_"))
@@ -47,6 +58,17 @@ class TestDrawnClips:
 
     def test_they_are_found_and_told_apart(self):
         assert {*filter(clips.is_reported, clips.find_clips())} == {*clips.drawn_clips(turbrestore.__version__)}
+
+
+def test_a_release_is_compared_with_the_one_before():
+    first, second = (
+        history.Release(name, psnr, (1.0, 2.0, 3.0), (9.0, 9.0, 9.0), 1000)
+        for name, psnr in (("1.0", (30.0, 31.0, 29.0)), ("1.1", (31.0, 30.0, 32.0)))
+    )
+    row, after = [line for line in history.document([first, second], 20.0).splitlines() if line.startswith("| 1.")]
+    assert row == "| 1.0 | 30.00 | – | – | 2.0 | 9 | 1,000 |"
+    # Gains of 1, −1 and 3 dB: their standard deviation is 2.
+    assert after == "| 1.1 | 31.00 | +1.00 ± 1.15 | -1.00 | 2.0 | 9 | 1,000 |"
 
 
 def test_reported_and_other_clips_have_means_of_their_own():
