@@ -103,8 +103,8 @@ def behind_air(case: Case, rng: np.random.Generator, codec: bool = True) -> tupl
 def behind_lens(case: Case, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Frames of a photograph behind a Gaussian lens, which smooth flows move by 1.3 px or not at all.
 
-    The photograph is finer than the frames, whose pixels average it: frames interpolated from coarser ones would lack
-    detail that a camera records, which a method that sharpens would seem to restore.
+    The photograph has more samples than the frames, whose pixels average them: frames interpolated from a picture of
+    their own resolution would lack detail that a camera records, which a method that sharpens would seem to restore.
     """
     height, width = LENS
     count, noise = (30, 0.008) if case.kind == "lens" else (24, 0.004)
@@ -118,9 +118,9 @@ def behind_lens(case: Case, rng: np.random.Generator) -> tuple[FloatArray, Float
     flows -= flows.mean(axis=0)
     frames = []
     for flow in flows:
-        frame = _pixels(warp(scene, invert_flow(flow)))
-        frame = cv2.GaussianBlur(frame, (0, 0), case.number) if case.number else frame
-        frames.append(_inner(frame) + noise * rng.standard_normal((height, width)))
+        frame = warp(scene, invert_flow(flow))
+        frame = cv2.GaussianBlur(frame, (0, 0), FINER * case.number) if case.number else frame
+        frames.append(_inner(_pixels(frame)) + noise * rng.standard_normal((height, width)))
     return np.array(frames, np.float32), _inner(_pixels(scene)).copy()
 
 

@@ -98,9 +98,10 @@ def document(releases: list[Release], mean: float) -> str:
         "",
         f"Made by `python benchmarks/history.py`: {count} drawn clips, restored by the command of each release with",
         f"its defaults on one machine. The mean of the frames has {mean:.2f} dB. Time, start included, and peak",
-        "memory are means over the clips. A gain stands with its standard error and the least of one clip.",
+        "memory are means over the clips. Gains are over the release before, with their standard error; the least is",
+        "that of a single clip.",
         "",
-        "| release | mean PSNR, dB | gain over the last, dB | least gain, dB | time, s | memory, MB | package, lines |",
+        "| release | mean PSNR, dB | gain, dB | least gain, dB | time, s | memory, MB | package, lines |",
         "|---|---|---|---|---|---|---|",
     ]
     for before, release in zip([None, *releases], releases, strict=False):
