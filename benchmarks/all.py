@@ -28,6 +28,8 @@ from texts import fill_texts
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results"
+# What the origin of a table says if its script has failed.
+BROKEN = "; a bound does not hold"
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ def make(name: str, table: Table) -> bool:
     path, now = RESULTS / f"{name}.md", revision()
     if now.isalnum() and now != "unknown" and path.exists() and _is_of(path, now):
         print(f"{name}: of this revision already", flush=True)
-        return True
+        return BROKEN not in origin_of(path)
     if reason := table.missing():
         print(f"{name}: left as it is: {reason}", flush=True)
         return True
@@ -125,6 +127,12 @@ def make(name: str, table: Table) -> bool:
     written = path.exists() and path.read_bytes() != before
     if written and not _is_of(path, now):
         path.write_text(with_origin(path.read_text("utf-8"), _children() - spent), "utf-8")
+    if written and done.returncode:
+        text = path.read_text("utf-8")
+        path.write_text(LINE.sub(lambda found: found[0].replace(".*\n", f"{BROKEN}.*\n"), text), "utf-8")
+    if revision() != now:
+        print(f"{name}: the code has changed since revision {now}", flush=True)
+        return False
     end = "" if done.returncode == 0 else f", exit status {done.returncode}: {''.join(done.stderr.splitlines()[-1:])}"
     print(f"{name}: {time.monotonic() - clock:.0f} s{'' if written else ', NOT WRITTEN'}{end}", flush=True)
     return written and done.returncode == 0

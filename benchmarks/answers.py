@@ -227,7 +227,7 @@ def _checked(folder: Path, entry: dict[str, Any]) -> Question:
     path = folder / LISTING
     if lacking := [name for name in FIELDS if not entry[name]]:
         raise DataError(f"{path}: expected {', '.join(FIELDS)} of every clip, found no {lacking[0]}")
-    name, kind, licence = (str(entry[field]).replace("|", "/") for field in ("clip", "kind", "licence"))
+    name, kind, licence = (str(entry[field]) for field in ("clip", "kind", "licence"))
     if kind not in READERS:
         raise DataError(f"{path}: expected a kind of {', '.join(READERS)}, found {kind}")
     reader, answer = READERS[kind], entry["answer"]
@@ -384,8 +384,12 @@ def _of_simulations(quick: bool) -> str:
 
 def _of_own(folder: Path) -> str:
     asked = [question for question in listed(folder) if _can_read(question.kind)]
-    lines = [f"| {one.name} | {one.licence} | {_cells(one.kind, [_row(one)])} |\n" for one in asked]
+    lines = [f"| {_cell(one.name)} | {_cell(one.licence)} | {_cells(one.kind, [_row(one)])} |\n" for one in asked]
     return f"# What a machine reads\n\n| clip | licence | {COLUMN_HEADS}{''.join(lines)}"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
 
 
 def _can_read(kind: str) -> bool:

@@ -105,6 +105,7 @@ def behind_lens(case: Case, rng: np.random.Generator) -> tuple[FloatArray, Float
 
     The photograph has more samples than the frames, whose pixels average them: frames interpolated from a picture of
     their own resolution would lack detail that a camera records, which a method that sharpens would seem to restore.
+    Where the photograph is smaller than that (page, coins), the scene itself is soft.
     """
     height, width = LENS
     count, noise = (30, 0.008) if case.kind == "lens" else (24, 0.004)

@@ -136,8 +136,8 @@ def presets_document(measured: dict[str, dict[str, Cost]]) -> tuple[str, bool]:
         "# Presets: quality against time\n",
         "What `TURBRESTORE_DATA=DIR python benchmarks/flow_calls.py --presets --write benchmarks/results/presets.md` "
         f"measures on {len(measured)} simulated clips, whole: PSNR of the restored image against the truth, and the "
-        "processor time of the restoration. All but `standard` have one inner pass of the filter; `fast` measures "
-        "flow at half the resolution, its neighbours at the whole one with patches 8 or 6 pixels apart.\n",
+        "processor time of the restoration. All but `standard` have one inner pass of the filter; the search for flow "
+        "ends at a quarter of the resolution with `fast`, and at half of it with the others.\n",
         "![PSNR against processor time](presets.png)\n",
         f"| setting | CPU, s | times as fast as standard | PSNR, dB | {' | '.join(measured)} |",
         f"|---|---:|---:|---:|{'---:|' * len(measured)}",

@@ -25,7 +25,7 @@ import turbrestore
 from turbrestore.core.arrays import FloatArray
 from turbrestore.metrics import compare
 
-# Releases, and the revisions that they were made from.
+# Versions of the changelog, and revisions whose code has their number.
 RELEASES = {"0.1.0": "85ac0a9", "0.2.0": "a8c87a1", "0.3.0": "698b073", turbrestore.__version__: None}
 # A command that prints its largest memory, MB, at its end.
 COMMAND = """import sys
@@ -97,9 +97,9 @@ def document(releases: list[Release], mean: float) -> str:
         "# Releases",
         "",
         f"Made by `python benchmarks/history.py`: {count} drawn clips, restored by the command of each release with",
-        f"its defaults on one machine. The mean of the frames has {mean:.2f} dB. Time, start included, and peak",
-        "memory are means over the clips. Gains are over the release before, with their standard error; the least is",
-        "that of a single clip.",
+        f"its defaults on one machine, with the libraries of today. The mean of the frames has {mean:.2f} dB. Time,",
+        "start included, and peak memory are means over the clips. Gains are over the release before, with their",
+        "standard error; the least is that of a single clip.",
         "",
         "| release | mean PSNR, dB | gain, dB | least gain, dB | time, s | memory, MB | package, lines |",
         "|---|---|---|---|---|---|---|",

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
+import numpy as np
 from ablation import SIGMAS, stages
 from clips import Clip
+from methods.deblurring import deblurred, levels_of
 from peer_tables import LEADS, TURBRESTORE, Results, Trial, Trials, leaders, reader_of
 from words import share_read
 
 from turbrestore.blur.psf import GAUSSIAN
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import TurbrestoreError
-from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+from turbrestore.deconvolution.problem import largest_width
 from turbrestore.metrics import compare
 from turbrestore.pipeline import Restoration, restore
 from turbrestore.registration.recentring import recentre
 
-# Widths from half to twice the one that is removed are tried; these where none is removed.
-SMALL = SIGMAS[:9]
+# Widths are tried as multiples of the one that is removed; these, pixels, where none is removed.
+MULTIPLES, SMALL = np.geomspace(0.5, 2, 9), SIGMAS[1:9]
 # λ is multiplied by these.
 FACTORS = (0.5, 2.0)
 
@@ -44,25 +48,27 @@ def try_others(results: Results, clips: Mapping[str, Clip]) -> Trials:
 def tried(restoration: Restoration, clip: Clip, figure: str, wanted: float) -> list[Trial]:
     """Figures with other widths, and where those are not enough, with a Gaussian and with another λ.
 
-    Nothing where no blur was looked for.  The first trial is what was removed, on the same way.
+    Nothing where no blur was looked for.  The first trial is what was removed, as all of them at the levels of the
+    restoration, but without what follows the deconvolution: detail that the halves of the clip do not share.
     """
     if restoration.deconvolution is None or restoration.posterior is None or restoration.filtered is None:
         return []
     filtered, removed, exponent = stages(restoration)
-    guide = recentre(restoration.centroid.image, restoration.filtered.mean_flow)
+    guide, levels = recentre(restoration.centroid.image, restoration.filtered.mean_flow), levels_of(clip.frames)
+    widths = _widths(removed, largest_width(filtered.shape))
 
     def attempt(width: float, shape: float, factor: float = 1.0) -> Trial:
-        params = DeconvolutionParams(exponent=shape)
+        params = DeconvolutionParams(sigma=width, exponent=shape)
+        found = deblurred(filtered, levels, params, guide, restoration.noise)
         if factor != 1:
-            usual = deconvolve(filtered, width, params, guide, noise=restoration.noise).fidelity
-            params = DeconvolutionParams(exponent=shape, fidelity=factor * usual)
-        image = deconvolve(filtered, width, params, guide, noise=restoration.noise).image
-        return Trial(_score(image, clip, figure), width, shape, factor)
+            params = replace(params, fidelity=factor * found.fidelity)
+            found = deblurred(filtered, levels, params, guide, restoration.noise)
+        return Trial(_score(found.image, clip, figure), width, shape, factor)
 
     def rounds() -> Iterator[list[Trial]]:
-        yield [attempt(removed, exponent), *(attempt(width, exponent) for width in _widths(removed))]
+        yield [attempt(removed, exponent), *(attempt(width, exponent) for width in widths)]
         if figure.startswith("psnr"):
-            yield [attempt(width, GAUSSIAN) for width in _widths(removed)]
+            yield [attempt(width, GAUSSIAN) for width in widths if width]
         best = max(trials, key=lambda trial: trial.figure)
         yield [attempt(best.width, best.exponent, factor) for factor in FACTORS if best.width]
 
@@ -74,9 +80,9 @@ def tried(restoration: Restoration, clip: Clip, figure: str, wanted: float) -> l
     return trials
 
 
-def _widths(removed: float) -> list[float]:
-    near = [width for width in SIGMAS if removed / 2 <= width <= 2 * removed] if removed else SMALL
-    return [0.0, *(width for width in near if width)]
+def _widths(removed: float, largest: float) -> list[float]:
+    near = removed * MULTIPLES if removed else SMALL
+    return [0.0, *(float(width) for width in near if width <= largest and width != removed)]
 
 
 def _score(image: FloatArray, clip: Clip, figure: str) -> float:

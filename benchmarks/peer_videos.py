@@ -47,7 +47,8 @@ def measure_videos(networks: Mapping[str, Path]) -> dict[str, dict[str, Figures]
         for method, run in VIDEO_METHODS.items():
             begun = processor_seconds()
             video = np.clip(run(frames), 0, 1)
-            results[name][method] = score_video(video, truth) | {"seconds": round(processor_seconds() - begun, 2)}
+            spent = {"seconds": round(processor_seconds() - begun, 2)}
+            results[name][method] = score_video(video, truth) | spent
         for method, python in networks.items() if name == MADE else ():
             video, used = run_package(method, frames, python)
             results[name][f"{method} (network)"] = score_video(video, truth) | {"seconds": used["seconds"]}

@@ -21,13 +21,14 @@ from typing import Any
 
 import numpy as np
 from clips import Clip, find_clips
+from methods.deblurring import deblurred, levels_of
 from methods.diffeomorphic import deblurred_template
 from methods.low_rank import low_rank_image
 from methods.packages import NETWORK, PACKAGES, PackageError, make_environment, run_package
 from methods.sobolev import sobolev_latent_image
 from methods.usage import peak_megabytes, processor_seconds
 from peer_causes import try_others
-from peer_tables import READ, SAME, TURBRESTORE, Figures, Results, Trials, document
+from peer_tables import INSEPARABLE, READ, SAME, TURBRESTORE, Figures, Results, Trials, document
 from peer_videos import measure_videos
 from provenance import publish
 from quality import panel
@@ -36,13 +37,11 @@ from words import can_read, share_read
 
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import TurbrestoreError
-from turbrestore.deblurring.remove_blur import remove_blur_steps
 from turbrestore.footage.frame_selection import best_frames, frame_quality
 from turbrestore.io.images.image_files import write_image
 from turbrestore.io.output import atomic_write
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
-from turbrestore.runtime.steps import finish
 
 # Share of the frames that a lucky average keeps: as the stacker does here.
 LUCKY = 0.5
@@ -157,9 +156,10 @@ def run_child(task: dict[str, Any]) -> dict[str, Any]:
     name, folder = task["method"], Path(task["folder"])
     spent: dict[str, Figures] = {}
     failed: dict[str, str] = {}
+    warm = np.load(folder / f"{task['clips'][0]}.npy")[WARM]
     if name in METHODS:
-        METHODS[name](np.load(folder / f"{task['clips'][0]}.npy")[WARM])
-    finish(remove_blur_steps(*[np.load(folder / f"{task['clips'][0]}.npy")[WARM].mean(axis=0)] * 2))
+        METHODS[name](warm)
+    deblurred(warm.mean(axis=0), levels_of(warm))
     for clip in task["clips"]:
         frames = np.load(folder / f"{clip}.npy")
         begun = processor_seconds()
@@ -173,10 +173,13 @@ def run_child(task: dict[str, Any]) -> dict[str, Any]:
         except TurbrestoreError as error:
             failed[clip] = str(error)
             continue
-        begun = processor_seconds()
+        if merged is sharp:
+            used[INSEPARABLE] = 1.0
         if sharp is None:
-            sharp = finish(remove_blur_steps(merged, merged)).deconvolution.image
-        spent[clip] = used | {"deblurring": processor_seconds() - begun}
+            levels, begun = levels_of(frames), processor_seconds()
+            sharp = deblurred(merged, levels).image
+            used["seconds"] += processor_seconds() - begun
+        spent[clip] = used
         np.savez(folder / f"{name}-{clip}.npz", merged=merged, sharp=sharp)
     return {"clips": spent, "failed": failed}
 

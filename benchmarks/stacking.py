@@ -21,6 +21,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from provenance import with_origin
 
 from turbrestore.core.arrays import FloatArray, luminance
 from turbrestore.io.images.image_files import read_image, write_image
@@ -292,7 +293,7 @@ def main() -> None:
             print(line, flush=True)
             lines.append(line)
     if options.write is not None:
-        options.write.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        options.write.write_text(with_origin("\n".join(lines) + "\n"), encoding="utf-8")
 
 
 if __name__ == "__main__":

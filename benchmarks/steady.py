@@ -22,6 +22,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from provenance import with_origin
 
 from turbrestore.core.arrays import FloatArray, luminance
 from turbrestore.io.containers.encoding import Encoding
@@ -288,7 +289,8 @@ def main() -> None:
         print(rows[-1], flush=True)
     if options.write is not None:
         command = f"`python benchmarks/steady.py {options.clips}`"
-        options.write.write_text("\n".join([f"Steadied video, {command}", NOTE, *rows, ""]))
+        text = "\n".join([f"Steadied video, {command}", NOTE, *rows, ""])
+        options.write.write_text(with_origin(text), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -23,13 +23,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 from clips import drawn_clips
+from methods.deblurring import deblurred, levels_of
 from provenance import arguments, publish
 
 import turbrestore
 from turbrestore.core.arrays import FloatArray, luminance
 from turbrestore.core.gradient import sobel_gradient
 from turbrestore.core.verdict import Verdict
-from turbrestore.deconvolution.deconvolve import DeconvolutionParams, deconvolve
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.io.source import FrameSource
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
@@ -212,13 +213,12 @@ def bend(image: FloatArray, truth: FloatArray) -> float:
 def judge(task: tuple[str, str]) -> Row:
     """Restore a clip and compare it with its truth."""
     frames, truth, sigma = make(*task)
-    params = RestoreParams(deconvolution=DeconvolutionParams(sigma=sigma))
-    found = restore(FrameSource.from_array(frames), params, Runtime(threads=1))
+    params, one = RestoreParams(deconvolution=DeconvolutionParams(sigma=sigma)), Runtime(threads=1)
+    found = restore(FrameSource.from_array(frames), params, one)
     assert found.filtered is not None
-    # Over its own range, as the stages see it.
-    wiener, fused = DeconvolutionParams(method="wiener"), found.filtered.image
-    fused = (fused - fused.min()) / np.ptp(fused)
-    sharpened = [deconvolve(fused, width, wiener, runtime=Runtime(threads=1)).image for width in WIDTHS]
+    fused, levels = found.filtered.image, levels_of(frames)
+    wiener = [DeconvolutionParams(method="wiener", sigma=width) for width in WIDTHS]
+    sharpened = [deblurred(fused, levels, each, noise=found.noise, runtime=one).image for each in wiener]
     result, mean, *others = (compare(image, truth).psnr_fit for image in (found.image, found.mean, fused, *sharpened))
     return Row(*task, result, mean, max(result, *others), bend(found.image, truth), found.is_mean, found.verdict)
 

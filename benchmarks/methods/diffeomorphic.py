@@ -27,14 +27,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from methods.deblurring import deblurred, levels_of
 from turbrestore.blur.psf import GAUSSIAN
 from turbrestore.core.arrays import FloatArray
-from turbrestore.deblurring.remove_blur import remove_blur_steps
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.registration.flow import estimate_flow
 from turbrestore.registration.flow_algebra import compose_flows, invert_flow
 from turbrestore.registration.warp import warp
-from turbrestore.runtime.steps import finish
 
 DEBLURRING = DeconvolutionParams(method="tv", exponent=GAUSSIAN)
 
@@ -52,4 +51,4 @@ def template(frames: FloatArray, reference: int = 0) -> FloatArray:
 def deblurred_template(frames: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the template of frames, and the template without its blur."""
     fused = template(frames)
-    return fused, finish(remove_blur_steps(fused, fused, DEBLURRING)).deconvolution.image
+    return fused, deblurred(fused, levels_of(frames), DEBLURRING).image

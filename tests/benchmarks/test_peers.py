@@ -11,6 +11,7 @@ import peers
 import pytest
 from clips import Clip
 from methods import packages
+from methods.deblurring import deblurred, levels_of
 from methods.packages import NETWORK, PackageError, make_environment, run_package
 from peer_causes import tried, try_others
 from peer_tables import Trial, document
@@ -19,6 +20,8 @@ from provenance import LINE
 
 import turbrestore
 from conftest import make_sequence
+from turbrestore.deconvolution.deconvolve import DeconvolutionParams
+from turbrestore.footage.levels import Levels
 from turbrestore.metrics import compare
 from turbrestore.pipeline import restore
 
@@ -36,9 +39,23 @@ def folder(tmp_path_factory):
 def test_a_method_leaves_both_images_and_says_what_it_used(method, folder):
     used = peers.run_child({"method": method, "folder": str(folder), "clips": ["tiny"], "python": None})
     assert used["failed"] == {}
-    assert set(used["clips"]["tiny"]) == {"seconds", "peak", "deblurring"}
+    assert set(used["clips"]["tiny"]) == {"seconds", "peak"}
     with np.load(folder / f"{method}-tiny.npz") as images:
         assert images["merged"].shape == images["sharp"].shape == (72, 72)
+
+
+def test_others_are_deblurred_at_the_levels_of_the_restoration(folder):
+    frames = np.load(folder / "tiny.npy")
+    pale, levels = 0.4 + 0.2 * frames, levels_of(0.4 + 0.2 * frames)
+    span = levels.stretched(pale)
+    assert levels.gain > 2 and span.min() > 0 and span.max() < 1
+    params = DeconvolutionParams(sigma=1.0)
+    found = deblurred(pale.mean(axis=0), levels, params)
+    whole = deblurred(levels.stretched(pale.mean(axis=0)), Levels(), params)
+    np.testing.assert_allclose(levels.stretched(found.image), whole.image, atol=1e-5)
+    # At its own levels λ is another, and so is the image.
+    other = deblurred(pale.mean(axis=0), Levels(), params).image
+    assert np.abs(found.image - other).mean() > 1e-4
 
 
 def test_every_method_has_a_meaning():
@@ -57,7 +74,7 @@ def test_a_package_that_fails_is_left_out_with_its_reason(folder, tmp_path):
 
 
 FIGURES = {"psnr": 20.0, "psnr_sharp": 25.0, "ssim": 0.5, "ssim_sharp": 0.6}
-SPENT = {"seconds": 1.0, "deblurring": 0.5, "peak": 100.0}
+SPENT = {"seconds": 1.0, "peak": 100.0}
 
 
 class TestDocument:
@@ -70,7 +87,7 @@ class TestDocument:
 
     def test_means_are_those_of_the_clips(self):
         text = self.document()
-        assert "| turbrestore | 25.00 | 25.00 | 0.500 | 0.600 | – | – | – | – | 1.0 | 0.5 | 100 |" in text
+        assert "| turbrestore | 25.00 | 25.00 | 0.500 | 0.600 | – | – | – | – | 1.0 | 100 |" in text
         assert "- other: not installed" in text
         assert "On no clip." in text
 
@@ -94,7 +111,12 @@ class TestDocument:
                 "1.20 px in place of 2.00 px as a Gaussian in place of an exponent of 1.67 it has",
             ),
             ({}, Trial(25.4, 0.0, 2.0), "By removing no blur in place of 2.00 px it has 25.40"),
-            ({}, Trial(25.4, 2.0, 1.67, 0.5), "in place of 2.00 px with half the λ it has 25.40"),
+            ({}, Trial(25.4, 2.0, 1.67, 0.5), "By removing 2.00 px with half the λ it has 25.40"),
+            (
+                {},
+                Trial(25.4, 2.0, 1.67),
+                "The same blur, removed without noise by level and the checks that follow, gives",
+            ),
             ({"psnr": 15.0}, None, "Before deblurring mean is 5.00 dB ahead already."),
             ({"psnr": 20.0}, None, "Before deblurring mean is neither ahead nor behind"),
             ({"centroid_sharp": 30.0}, Trial(25.4, 1, 2), "At the mean geometry of the clip turbrestore is ahead"),
@@ -105,6 +127,12 @@ class TestDocument:
         results = {"mean": {"a": lead}, "turbrestore": {"a": {**FIGURES, "psnr": 25.0, **own}}}
         trials = {("a", "psnr_sharp"): [Trial(25.0, 2.0, 1.67), best]} if best else {}
         assert said in document(results, {}, {}, {}, trials=trials)
+
+    def test_stages_of_a_method_that_returns_one_image_are_not_told_apart(self):
+        lead = {**FIGURES, "psnr_sharp": 25.4}
+        for inseparable, said in (({"inseparable": 1.0}, "mean sharpens as it merges"), ({}, "Before deblurring mean")):
+            results = {"mean": {"a": lead | inseparable}, "turbrestore": {"a": {**FIGURES, "psnr": 25.0}}}
+            assert said in document(results, {}, {}, {})
 
     def test_a_network_has_a_table_and_spoils_no_mean_where_it_did_not_run(self):
         drawn, other = "drawn_air_page", "quick_chart"
@@ -157,6 +185,8 @@ class TestTrials:
         assert {one.factor for one in trials} == {0.5, 1, 2} and {first.exponent, 2.0} == {
             one.exponent for one in trials
         }
+        widths = {one.width for one in trials}
+        assert max(widths) == pytest.approx(2 * first.width) and min(widths - {0}) == pytest.approx(first.width / 2)
         few = tried(whole, clip, "psnr_sharp", 0.0)
         assert {one.exponent for one in few} == {first.exponent} and len(few) < len(trials)
 

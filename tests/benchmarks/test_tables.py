@@ -165,6 +165,25 @@ class TestAll:
         assert not everything.make("t", table)
         assert "NOT WRITTEN" in capsys.readouterr().out
 
+    def test_a_bound_that_is_broken_stays_broken_until_the_code_changes(self, tmp_path, monkeypatch, capsys):
+        script = tmp_path / "script.py"
+        script.write_text("import sys; open(sys.argv[-1], 'w').write('# T\\n\\nText.\\n'); sys.exit(1)")
+        monkeypatch.setattr(everything, "RESULTS", tmp_path)
+        for module in (everything, provenance):
+            monkeypatch.setattr(module, "revision", lambda: "abc1234")
+        table = everything.Table(str(script))
+        assert not everything.make("t", table) and not everything.make("t", table)
+        assert "t: of this revision already" in capsys.readouterr().out
+        assert "a bound does not hold" in everything.origin_of(tmp_path / "t.md")
+
+    def test_a_table_of_code_that_changes_meanwhile_does_not_count(self, tmp_path, monkeypatch, capsys):
+        script, revisions = tmp_path / "script.py", iter(["abc1234", "def5678"])
+        script.write_text("import sys; open(sys.argv[-1], 'w').write('# T\\n\\nText.\\n')")
+        monkeypatch.setattr(everything, "RESULTS", tmp_path)
+        monkeypatch.setattr(everything, "revision", lambda: next(revisions))
+        assert not everything.make("t", everything.Table(str(script)))
+        assert "the code has changed since revision abc1234" in capsys.readouterr().out
+
 
 class TestTexts:
     def test_figures_are_those_of_the_tables(self):
@@ -180,6 +199,20 @@ class TestTexts:
         assert texts.read_table("t", "B") == {}
 
 
+def test_leads_are_those_that_the_table_lists(tmp_path, monkeypatch):
+    scores = (
+        "| clip | mean | turbrestore |\n|---|---:|---:|\n| drawn_a | 29.52 | 29.47 |\n| drawn_b | 31.00 | 30.00 |\n"
+    )
+    (tmp_path / "peers.md").write_text(
+        "# T\n\n## Means\n\n| method | x |\n|---|---|\n\n## Where another method is ahead\n\n"
+        "- drawn_b: mean 31.00, low rank 30.50; turbrestore 30.00 dB. By removing 1.20 px it has 31.00.\n"
+        "- turbtext_d1: mean 0.90; turbrestore 0.50 of the words by tesseract.\n"
+        f"\n## {texts.SCORES}\n\n{scores}"
+    )
+    monkeypatch.setattr(texts, "RESULTS", tmp_path)
+    assert "Another method is ahead in PSNR on 1 of the 2 clips, by up to 1.0 dB." in texts.methods()
+
+
 def test_a_script_that_prints_its_table_stores_it_below_its_heading(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["script.py", "--write", str(tmp_path / "t.md"), "rest"])
     assert provenance.publish_printed("# T", lambda: 3 * bool(sys.stdout.write("| 1 |\n"))) == 3
@@ -188,12 +221,12 @@ def test_a_script_that_prints_its_table_stores_it_below_its_heading(tmp_path, mo
 
 
 def test_what_would_help_is_read_from_the_right_cells(tmp_path, monkeypatch):
-    head = "| clip | mean | product | true flow | true blur | against the scene |\n|---|---:|---:|---:|---:|---:|\n"
+    head = "| clip | mean | turbrestore | true flow | true blur | against the scene |\n|---|---:|---:|---:|---:|---:|\n"
     (tmp_path / "oracles.md").write_text(
         f"# T\n\n## One thing made worse at a time\n\n{head}| base | 1 | 20.00 | 1 | 22.50 | 1 |\n"
         f"| noise 0.05 | 1 | 19.25 | 1 | 1 | 1 |\n\n## More frames\n\n{head}| 8 frames | 1 | 10.00 | 1 | 1 | 5.00 |\n"
         f"| 30 frames | 9 | 9 | 9 | 9 | 9 |\n| 120 frames | 1 | 10.40 | 1 | 1 | 11.00 |\n\n"
-        f"## Other air and other cameras\n\n{head}| here | 1 | 10.00 | 1 | 13.00 | 1 |\n"
+        f"## Other turbulence and other cameras\n\n{head}| here | 1 | 10.00 | 1 | 13.00 | 1 |\n"
         f"| there | 1 | 10 | 1 | 9.00 | 1 |\n"
     )
     monkeypatch.setattr(texts, "RESULTS", tmp_path)
