@@ -124,15 +124,18 @@ def make(name: str, table: Table) -> bool:
         words = [word.format(scratch=scratch) for word in table.words.split()]
         command = [sys.executable, str(HERE / words[0]), *words[1:], "--write", str(path)]
         done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=HERE.parent, env=_environment())
+    if revision() != now:
+        path.unlink(missing_ok=True)
+        if before:
+            path.write_bytes(before)
+        print(f"{name}: NOT WRITTEN, the code has changed since revision {now}", flush=True)
+        return False
     written = path.exists() and path.read_bytes() != before
     if written and not _is_of(path, now):
         path.write_text(with_origin(path.read_text("utf-8"), _children() - spent), "utf-8")
-    if written and done.returncode:
+    if written and done.returncode and "Traceback" not in done.stderr:
         text = path.read_text("utf-8")
         path.write_text(LINE.sub(lambda found: found[0].replace(".*\n", f"{BROKEN}.*\n"), text), "utf-8")
-    if revision() != now:
-        print(f"{name}: the code has changed since revision {now}", flush=True)
-        return False
     end = "" if done.returncode == 0 else f", exit status {done.returncode}: {''.join(done.stderr.splitlines()[-1:])}"
     print(f"{name}: {time.monotonic() - clock:.0f} s{'' if written else ', NOT WRITTEN'}{end}", flush=True)
     return written and done.returncode == 0

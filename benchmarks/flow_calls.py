@@ -137,7 +137,8 @@ def presets_document(measured: dict[str, dict[str, Cost]]) -> tuple[str, bool]:
         "What `TURBRESTORE_DATA=DIR python benchmarks/flow_calls.py --presets --write benchmarks/results/presets.md` "
         f"measures on {len(measured)} simulated clips, whole: PSNR of the restored image against the truth, and the "
         "processor time of the restoration. All but `standard` have one inner pass of the filter; the search for flow "
-        "ends at a quarter of the resolution with `fast`, and at half of it with the others.\n",
+        "ends at a quarter of the resolution with `fast`, and at half of it with the others. "
+        "*Pixels* are the distance between patches.\n",
         "![PSNR against processor time](presets.png)\n",
         f"| setting | CPU, s | times as fast as standard | PSNR, dB | {' | '.join(measured)} |",
         f"|---|---:|---:|---:|{'---:|' * len(measured)}",

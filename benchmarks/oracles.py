@@ -44,12 +44,12 @@ COLUMNS = ("mean", "turbrestore", "true flow", "true blur", "both", "unlimited f
 SIMULATORS = {
     "screens": "phase screens",
     "kernels": "sums of random short exposures",
-    "lens": "smooth flows of blurred scenes",
+    "lens": "blurred scenes, still or moved by smooth flows",
     "mixed": "blur that differs from place to place",
     "near": "blur of 3 to 8 px that differs from place to place",
     "close": "sums of short exposures, 2 to 7.5 px wide",
     "chamber": "words in a heat chamber, 2.5 to 8 px wide",
-    "none": "no air",
+    "none": "no turbulence",
 }
 # First seed, and number of clips of each simulator.
 UNSEEN, CLIPS = 9000, 5
@@ -103,16 +103,16 @@ def measure(scene: str, case: Case) -> Row:
     whole = restore(frames)
     filtered = whole.centroid.image if whole.filtered is None else whole.filtered.image
     sigma = 0.0 if whole.deconvolution is None else whole.deconvolution.sigma
-    same = DeconvolutionParams(sigma=sigma, exponent=None if whole.blur is None else whole.blur.exponent)
+    same = DeconvolutionParams(sigma=sigma, exponent=None if whole.posterior is None else whole.posterior.exponent)
     merged = np.mean([warp(frame, flow) for frame, flow in zip(frames, flows, strict=True)], axis=0, dtype=np.float32)
     limit = cv2.GaussianBlur(truth, (0, 0), case.blur)
-    levels, (guide, noise) = levels_of(frames), _known(whole)
+    levels = levels_of(frames)
     images = {
         "mean": whole.mean,
         "turbrestore": whole.image,
-        "true flow": deblurred(merged, levels, same, guide, noise).image,
-        "true blur": deblurred(filtered, levels, blur_of(filtered, registered(truth, filtered)), guide, noise).image,
-        "both": deblurred(merged, levels, blur_of(merged, truth), guide, noise).image,
+        "true flow": deblurred(merged, levels, same).image,
+        "true blur": deblurred(filtered, levels, blur_of(filtered, registered(truth, filtered)), *_known(whole)).image,
+        "both": deblurred(merged, levels, blur_of(merged, truth)).image,
         "unlimited frames": deblurred(limit, levels, blur_of(limit, truth)).image,
     }
     inner = np.s_[BORDER:-BORDER, BORDER:-BORDER]
@@ -173,7 +173,7 @@ def document(rows: dict[str, Row], scenes: tuple[str, ...], simulated: dict[str,
             "- **true flow**: mean of the frames registered by their true flows, deblurred by the width that "
             "turbrestore removes.\n"
             "- **true blur**: filtered image of turbrestore, deblurred by the width and shape of its true transfer "
-            "function, which is fitted to the truth.\n"
+            "function, which is fitted to the truth; without weights by brightness and without the checks that follow.\n"
             "- **both**: both; all that so many frames can give to this deconvolution.\n"
             "- **unlimited frames**: the blurred scene without noise, deblurred by its true blur.\n"
             "- **against the scene**: turbrestore, compared with the scene itself: what the mean geometry of so few "
@@ -185,8 +185,7 @@ def document(rows: dict[str, Row], scenes: tuple[str, ...], simulated: dict[str,
             "\n## Other turbulence and other cameras\n",
             f"Means over {clips} clips of each simulator, whose scene, number of frames, noise and codec are drawn at "
             "random; the networks that tell the blur were trained on other clips of the same simulators.  PSNR, dB, "
-            "is after the best gain and offset; *true blur* is as above, without the check of the detail that the "
-            "halves of a clip share.\n",
+            "is after the best gain and offset; *true blur* is as above.\n",
             *_table(simulated, simulated, SIMULATED),
             "",
         ]

@@ -38,6 +38,7 @@ from words import can_read, share_read
 from turbrestore.core.arrays import FloatArray
 from turbrestore.core.errors import TurbrestoreError
 from turbrestore.footage.frame_selection import best_frames, frame_quality
+from turbrestore.footage.levels import Levels
 from turbrestore.io.images.image_files import write_image
 from turbrestore.io.output import atomic_write
 from turbrestore.metrics import compare
@@ -159,7 +160,7 @@ def run_child(task: dict[str, Any]) -> dict[str, Any]:
     warm = np.load(folder / f"{task['clips'][0]}.npy")[WARM]
     if name in METHODS:
         METHODS[name](warm)
-    deblurred(warm.mean(axis=0), levels_of(warm))
+    deblurred(warm.mean(axis=0), Levels())
     for clip in task["clips"]:
         frames = np.load(folder / f"{clip}.npy")
         begun = processor_seconds()

@@ -218,7 +218,7 @@ def judge(task: tuple[str, str]) -> Row:
     assert found.filtered is not None
     fused, levels = found.filtered.image, levels_of(frames)
     wiener = [DeconvolutionParams(method="wiener", sigma=width) for width in WIDTHS]
-    sharpened = [deblurred(fused, levels, each, noise=found.noise, runtime=one).image for each in wiener]
+    sharpened = [deblurred(fused, levels, each, runtime=one).image for each in wiener]
     result, mean, *others = (compare(image, truth).psnr_fit for image in (found.image, found.mean, fused, *sharpened))
     return Row(*task, result, mean, max(result, *others), bend(found.image, truth), found.is_mean, found.verdict)
 

@@ -30,7 +30,7 @@ class SteadyParams:
         no blur is removed until it has been estimated.
     largest : float, optional
         Largest displacement by turbulence, pixels; larger ones count as motion and are kept.  By default it is measured
-        while the camera is static or locked, and 1 while it shakes.
+        while the camera rests or moves evenly, and falls towards 1 while it shakes.
 
     Raises
     ------
