@@ -173,7 +173,7 @@ def document(rows: dict[str, Row], scenes: tuple[str, ...], simulated: dict[str,
             "- **true flow**: mean of the frames registered by their true flows, deblurred by the width that "
             "turbrestore removes.\n"
             "- **true blur**: filtered image of turbrestore, deblurred by the width and shape of its true transfer "
-            "function, which is fitted to the truth; without weights by brightness and without the checks that follow.\n"
+            "function, which is fitted to the truth; without weights by brightness and the checks that follow.\n"
             "- **both**: both; all that so many frames can give to this deconvolution.\n"
             "- **unlimited frames**: the blurred scene without noise, deblurred by its true blur.\n"
             "- **against the scene**: turbrestore, compared with the scene itself: what the mean geometry of so few "

@@ -94,8 +94,9 @@ def document(
         "## Beside a network\n",
         _network(results),
         "## Where another method is ahead\n",
-        f"Each clip on which another method is ahead by {LEADS[f'psnr{SAME}']} dB or {LEADS[f'words{SAME}']} of the words, and where its lead arises.  The blur of a merged image of "
-        f"others is estimated from that image alone; {TURBRESTORE} also uses the frames.  Each lead is taken apart by "
+        f"Each clip on which another method is ahead by {LEADS[f'psnr{SAME}']} dB or {LEADS[f'words{SAME}']} of the "
+        "words, and where its lead arises.  The blur of a merged image of others is estimated from that image alone; "
+        f"{TURBRESTORE} also uses the frames.  Each lead is taken apart by "
         f"removing other widths from the merged image of {TURBRESTORE}, from half to twice the one that it has "
         "removed, or up to 1 px where it has removed none, and by removing none; where that is not enough, for PSNR a "
         "Gaussian in place of the estimated shape, and then half and twice the weight λ of the data at the best width. "

@@ -19,7 +19,7 @@ from turbrestore.runtime.steps import finish
 
 
 def levels_of(frames: FloatArray) -> Levels:
-    """Levels at which a restoration works, if nothing else is corrected: frames that use a part of the scale are stretched.
+    """Levels at which a restoration works if it corrects nothing else: a range that is part of the scale is stretched.
 
     λ weighs the data against the total variation, which grow with the square of the contrast and with the contrast: at
     other levels the same λ is another.

@@ -158,6 +158,14 @@ def test_words_are_compared_as_they_are_read(folder):
     assert answers.listed(path)[0].answer == ["ab12", "cde"]
 
 
+def test_a_stroke_in_a_name_is_part_of_the_path_and_no_cell(folder, capsys):
+    path, entries = folder
+    (path / "label").rename(path / "a|b")
+    listing(path, [entries[0] | {"clip": "a|b", "licence": "CC|BY"}])
+    assert answers.main([str(path)]) == 0
+    assert r"| a\|b | CC\|BY |" in capsys.readouterr().out
+
+
 def test_a_listed_clip_that_is_not_there_is_refused(folder, capsys):
     path, entries = folder
     listing(path, [entries[0] | {"clip": "lost.mp4"}])

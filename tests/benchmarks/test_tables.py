@@ -175,14 +175,21 @@ class TestAll:
         assert not everything.make("t", table) and not everything.make("t", table)
         assert "t: of this revision already" in capsys.readouterr().out
         assert "a bound does not hold" in everything.origin_of(tmp_path / "t.md")
+        script.write_text("import sys; open(sys.argv[-1], 'w').write('# T\\n\\nBetter.\\n')")
+        for module in (everything, provenance):
+            monkeypatch.setattr(module, "revision", lambda: "def5678")
+        assert everything.make("t", table) and "bound" not in everything.origin_of(tmp_path / "t.md")
 
     def test_a_table_of_code_that_changes_meanwhile_does_not_count(self, tmp_path, monkeypatch, capsys):
-        script, revisions = tmp_path / "script.py", iter(["abc1234", "def5678"])
+        script, revisions = tmp_path / "script.py", ["abc1234", "def5678"]
         script.write_text("import sys; open(sys.argv[-1], 'w').write('# T\\n\\nText.\\n')")
         monkeypatch.setattr(everything, "RESULTS", tmp_path)
-        monkeypatch.setattr(everything, "revision", lambda: next(revisions))
-        assert not everything.make("t", everything.Table(str(script)))
+        monkeypatch.setattr(everything, "revision", lambda: revisions.pop(0) if revisions else "def5678")
+        monkeypatch.setattr(provenance, "revision", lambda: "def5678")
+        table = everything.Table(str(script))
+        assert not everything.make("t", table) and not (tmp_path / "t.md").exists()
         assert "the code has changed since revision abc1234" in capsys.readouterr().out
+        assert everything.make("t", table) and (tmp_path / "t.md").exists()
 
 
 class TestTexts:
