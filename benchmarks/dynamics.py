@@ -97,9 +97,9 @@ def document(rows: dict[tuple[str, ...], Row]) -> str:
         "# Dynamics\n",
         "What `python benchmarks/dynamics.py --write benchmarks/results/dynamics.md` measures: PSNR "
         f"after deblurring, dB, against the scene at the mean geometry; phase screens, {COUNT} frames of {SIDE} pixels "
-        f"a side, of which 'missing' lacks {100 * MISSING:.0f} %.  The product registers frames by the measured flow.  "
+        f"a side, of which 'missing' lacks {100 * MISSING:.0f} %.  turbrestore registers frames by the measured flow.  "
         "The other columns are differences to it: of the flow of the model as the paper prints it, and of the true "
-        "flow, which no model of the motion can surpass.  All are deblurred by the width that the product removes.\n",
+        "flow, which no model of the motion can surpass.  All are deblurred by the width that turbrestore removes.\n",
         "| turbulence | frames | noise | scene | measured flow | flow of the model | true flow |",
         "|---|---|---:|---|---:|---:|---:|",
         *(f"| {' | '.join(key)} | {_cells(row)} |" for key, row in rows.items()),
