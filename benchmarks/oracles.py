@@ -24,17 +24,15 @@ from blur_calibration import registered, transfer_function
 from blur_clips import part_of
 from blur_simulators import simulate
 from clips import DRAWN_SCENES
-from methods.deblurring import deblurred, levels_of
+from methods.deblurring import deblurred, known, levels_of
 from provenance import publish
 
 from turbrestore.blur.witnesses.hypotheses import shapes
 from turbrestore.core.arrays import FloatArray
-from turbrestore.core.noise_spectrum import NoiseSpectrum
 from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.metrics import compare
-from turbrestore.pipeline import Restoration, restore
+from turbrestore.pipeline import restore
 from turbrestore.registration.flow_algebra import compose_flows, invert_flow
-from turbrestore.registration.recentring import recentre
 from turbrestore.registration.warp import warp
 from turbrestore.synthesis.smooth_flow import SmoothFlowParams, distort, smooth_flows
 
@@ -111,7 +109,7 @@ def measure(scene: str, case: Case) -> Row:
         "mean": whole.mean,
         "turbrestore": whole.image,
         "true flow": deblurred(merged, levels, same).image,
-        "true blur": deblurred(filtered, levels, blur_of(filtered, registered(truth, filtered)), *_known(whole)).image,
+        "true blur": deblurred(filtered, levels, blur_of(filtered, registered(truth, filtered)), *known(whole)).image,
         "both": deblurred(merged, levels, blur_of(merged, truth)).image,
         "unlimited frames": deblurred(limit, levels, blur_of(limit, truth)).image,
     }
@@ -131,8 +129,8 @@ def by_simulator(name: str, count: int) -> Row:
         whole = restore(drawn.frames)
         filtered = whole.centroid.image if whole.filtered is None else whole.filtered.image
         truth = registered(drawn.truth, filtered)
-        known = deblurred(filtered, levels_of(drawn.frames), blur_of(filtered, truth), *_known(whole)).image
-        rows.append([compare(image, truth).psnr_fit for image in (whole.mean, filtered, whole.image, known)])
+        told = deblurred(filtered, levels_of(drawn.frames), blur_of(filtered, truth), *known(whole)).image
+        rows.append([compare(image, truth).psnr_fit for image in (whole.mean, filtered, whole.image, told)])
         if len(rows) == count:
             return dict(zip(SIMULATED, np.mean(rows, axis=0), strict=True))
     raise AssertionError
@@ -146,12 +144,6 @@ def clip(scene: str, case: Case) -> tuple[FloatArray, FloatArray, FloatArray, Fl
     frames = distort(original, moved, rng, case.blur, case.noise)
     back = invert_flow(moved.mean(axis=0))
     return frames, np.stack([compose_flows(flow, back) for flow in moved]), warp(original, back), original
-
-
-def _known(whole: Restoration) -> tuple[FloatArray, NoiseSpectrum | None]:
-    """Guide and noise of a restoration."""
-    guide = whole.centroid.image
-    return guide if whole.filtered is None else recentre(guide, whole.filtered.mean_flow), whole.noise
 
 
 def blur_of(image: FloatArray, truth: FloatArray) -> DeconvolutionParams:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 
 import numpy as np
 from ablation import SIGMAS, stages
 from clips import Clip
-from methods.deblurring import deblurred, levels_of
+from methods.deblurring import deblurred, known, levels_of
 from peer_tables import LEADS, TURBRESTORE, Results, Trial, Trials, leaders, reader_of
 from words import share_read
 
@@ -20,7 +19,6 @@ from turbrestore.deconvolution.deconvolve import DeconvolutionParams
 from turbrestore.deconvolution.problem import largest_width
 from turbrestore.metrics import compare
 from turbrestore.pipeline import Restoration, restore
-from turbrestore.registration.recentring import recentre
 
 # Widths are tried as multiples of the one that is removed; these, pixels, where none is removed.
 MULTIPLES, SMALL = np.geomspace(0.5, 2, 9), SIGMAS[1:9]
@@ -54,15 +52,15 @@ def tried(restoration: Restoration, clip: Clip, figure: str, wanted: float) -> l
     if restoration.deconvolution is None or restoration.posterior is None or restoration.filtered is None:
         return []
     filtered, removed, exponent = stages(restoration)
-    guide, levels = recentre(restoration.centroid.image, restoration.filtered.mean_flow), levels_of(clip.frames)
+    levels, told = levels_of(clip.frames), known(restoration)
+    usual: dict[tuple[float, float], float] = {}
     widths = _widths(removed, largest_width(filtered.shape))
 
     def attempt(width: float, shape: float, factor: float = 1.0) -> Trial:
-        params = DeconvolutionParams(sigma=width, exponent=shape)
-        found = deblurred(filtered, levels, params, guide, restoration.noise)
-        if factor != 1:
-            params = replace(params, fidelity=factor * found.fidelity)
-            found = deblurred(filtered, levels, params, guide, restoration.noise)
+        fidelity = None if factor == 1 else factor * usual[width, shape]
+        params = DeconvolutionParams(sigma=width, exponent=shape, fidelity=fidelity)
+        found = deblurred(filtered, levels, params, *told)
+        usual.setdefault((width, shape), found.fidelity)
         return Trial(_score(found.image, clip, figure), width, shape, factor)
 
     def rounds() -> Iterator[list[Trial]]:

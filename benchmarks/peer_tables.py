@@ -99,8 +99,8 @@ def document(
         f"{TURBRESTORE} also uses the frames.  Each lead is taken apart by "
         f"removing other widths from the merged image of {TURBRESTORE}, from half to twice the one that it has "
         "removed, or up to 1 px where it has removed none, and by removing none; where that is not enough, for PSNR a "
-        "Gaussian in place of the estimated shape, and then half and twice the weight λ of the data at the best width. "
-        " The share of words is the best of all trials, and so partly chance.\n",
+        "Gaussian in place of the estimated shape, and then half and twice the weight λ of the data at the best "
+        "width.  The share of words is the best of all trials, and so partly chance.\n",
         _leads(results, trials or {}),
     ]
     for heading, figure, digits in (

@@ -14,6 +14,8 @@ from turbrestore.footage.levels import Levels
 from turbrestore.footage.lighting.range import find_range
 from turbrestore.footage.survey import take_survey
 from turbrestore.io.source import FrameSource
+from turbrestore.registration.recentring import recentre
+from turbrestore.results import Restoration
 from turbrestore.runtime.runtime import DEFAULT, Runtime
 from turbrestore.runtime.steps import finish
 
@@ -26,6 +28,12 @@ def levels_of(frames: FloatArray) -> Levels:
     """
     found = find_range(take_survey(FrameSource.from_array(frames)))
     return Levels() if found is None or found.levels is None else found.levels
+
+
+def known(restoration: Restoration) -> tuple[FloatArray, NoiseSpectrum | None]:
+    """Guide and noise with which a restoration was deblurred, at the levels of the clip."""
+    guide, filtered = restoration.centroid.image, restoration.filtered
+    return guide if filtered is None else recentre(guide, filtered.mean_flow), restoration.noise
 
 
 def deblurred(
@@ -42,7 +50,7 @@ def deblurred(
     """
     blurred = levels.stretched(image)
     seen = blurred if guide is None else levels.stretched(guide)
-    known = None if noise is None else noise.scaled(levels.gain**2)
-    steps = remove_blur_steps(blurred, seen, params, runtime=runtime, full_scale=levels.full_scale, noise=known)
+    stretched = None if noise is None else noise.scaled(levels.gain**2)
+    steps = remove_blur_steps(blurred, seen, params, runtime=runtime, full_scale=levels.full_scale, noise=stretched)
     found = finish(steps).deconvolution
     return replace(found, image=np.clip(levels.original(found.image), 0, 1))
